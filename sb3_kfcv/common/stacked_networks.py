@@ -1,0 +1,181 @@
+"""
+Many small networks as one: the networks of agents (or teachers) with equal shapes are stacked along a leading axis,
+so that evaluating all of them is a handful of batched matrix products instead of a Python loop.
+
+One order everywhere: (networks, batch, features). A stack of n networks computes what n separate ``nn.Sequential``
+of ``nn.Linear`` layers would, and is initialised as they are; :meth:`StackedMLP.network` takes one out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch as th
+from torch import nn
+
+
+class StackedLinear(nn.Module):
+    """
+    ``n`` linear layers side by side: (n, batch, in) → (n, batch, out).
+
+    :param n: number of layers
+    :param in_features: input size of each
+    :param out_features: output size of each
+    """
+
+    def __init__(self, n: int, in_features: int, out_features: int) -> None:
+        super().__init__()
+        bound = 1 / math.sqrt(in_features)  # the distribution of nn.Linear's own initialisation
+        self.weight = nn.Parameter(th.empty(n, in_features, out_features).uniform_(-bound, bound))
+        self.bias = nn.Parameter(th.empty(n, 1, out_features).uniform_(-bound, bound))
+
+    def forward(self, x: th.Tensor, members: th.Tensor | None = None, frozen: bool = False) -> th.Tensor:
+        """
+        :param x: (n, batch, in)
+        :param members: which layer serves each row of ``x``'s first axis; by default layer i serves row i
+        :param frozen: give no gradient to the parameters (and spend no time on it)
+        """
+        weight, bias = (self.weight.detach(), self.bias.detach()) if frozen else (self.weight, self.bias)
+        if members is not None:
+            weight, bias = weight[members], bias[members]
+        return th.baddbmm(bias, x, weight)
+
+
+class StackedMLP(nn.Module):
+    """
+    A stack of multi-layer perceptrons of one shape.
+
+    Networks may read the same input: with ``n_inputs=1`` all of them do, and their first layers are one matrix
+    product; with ``n_inputs=K`` consecutive runs of ``n_networks / K`` networks share one of K inputs. By default
+    each network has an input of its own.
+
+    Members may share a network: ``members[i]`` is the network that member i uses. Then every member has a
+    first-layer bias of its own, which is what appending its one-hot index to the input amounts to.
+
+    :param n_networks: number of networks
+    :param sizes: width of the input, of each hidden layer, and of the output
+    :param activation_fn: activation between layers
+    :param n_inputs: number of distinct inputs; a divisor of ``n_networks``
+    :param members: network of each member; by default member i uses network i
+    """
+
+    members: th.Tensor | None
+
+    def __init__(
+        self,
+        n_networks: int,
+        sizes: Sequence[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+        n_inputs: int | None = None,
+        members: Sequence[int] | None = None,
+    ) -> None:
+        super().__init__()
+        self.n_networks = n_networks
+        self.input_per_member = n_inputs is None
+        self.n_inputs = n_networks if n_inputs is None else n_inputs
+        self.sizes = list(sizes)
+        self.activation = activation_fn()
+        self.first = StackedLinear(self.n_inputs, sizes[0], n_networks // self.n_inputs * sizes[1])
+        self.rest = nn.ModuleList(StackedLinear(n_networks, n_in, n_out) for n_in, n_out in pairwise(sizes[1:]))
+        self.member_bias: nn.Parameter | None = None
+        self.register_buffer("members", None if members is None else th.tensor(list(members)), persistent=False)
+        if members is not None:
+            bound = 1 / math.sqrt(sizes[0] + len(members))
+            self.member_bias = nn.Parameter(th.empty(len(members), 1, sizes[1]).uniform_(-bound, bound))
+
+    def forward(self, x: th.Tensor) -> th.Tensor:
+        """
+        :param x: (inputs, batch, in); with own inputs per network: (members, batch, in)
+        :return: (members, batch, out)
+        """
+        return self.after_first_layer(self.first_layer(x))
+
+    def first_layer(self, x: th.Tensor) -> th.Tensor:
+        """
+        Pre-activations of the first layer.
+
+        :param x: as for :meth:`forward`
+        :return: (members, batch, hidden)
+        """
+        if self.input_per_member:
+            z = self.first(x, self.members)
+        else:
+            width = self.sizes[1]
+            z = self.first(x).unflatten(-1, (-1, width)).transpose(1, 2).flatten(0, 1)  # (networks, batch, hidden)
+            z = z if self.members is None else z[self.members]
+        return z if self.member_bias is None else z + self.member_bias
+
+    def after_first_layer(self, z: th.Tensor, frozen: bool = False) -> th.Tensor:
+        """
+        The rest of the networks.
+
+        :param z: (members, batch, hidden), pre-activations of the first layer
+        :param frozen: give no gradient to the parameters
+        :return: (members, batch, out)
+        """
+        for layer in self.rest:
+            z = layer(self.activation(z), self.members, frozen)
+        return z
+
+    def input_columns(self, members: th.Tensor, columns: th.Tensor) -> th.Tensor:
+        """
+        First-layer weights of some inputs of some members, for networks that all read one input (``n_inputs=1``).
+
+        :param members: (m,) numbers of the members
+        :param columns: (m, k) positions in the input
+        :return: (m, k, hidden), without gradient
+        """
+        weight = self.first.weight.detach()[0].unflatten(-1, (self.n_networks, self.sizes[1]))  # (in, networks, hidden)
+        networks = members if self.members is None else self.members[members]
+        return weight[columns, networks[:, None]]
+
+    def gradient_norms(self) -> th.Tensor:
+        """Euclidean norm of each network's gradient: (networks,)."""
+        squares = th.zeros(self.n_networks, device=self.first.weight.device)
+        for layer in [self.first, *self.rest]:
+            for parameter in (layer.weight, layer.bias):
+                squares += self._network_view(parameter.grad, layer).square().sum((1, 3)).flatten()
+        if self.member_bias is not None and self.member_bias.grad is not None:
+            squares.index_add_(0, self.members, self.member_bias.grad.square().sum((1, 2)))
+        return squares.sqrt()
+
+    def clip_gradients(self, max_norm: float) -> None:
+        """Scale the gradient of each network down to ``max_norm``, as ``clip_grad_norm_`` does for a separate one."""
+        scale = (max_norm / (self.gradient_norms() + 1e-6)).clamp(max=1.0)
+        for layer in [self.first, *self.rest]:
+            for parameter in (layer.weight, layer.bias):
+                view = self._network_view(parameter.grad, layer)
+                view.mul_(scale.view(view.shape[0], 1, view.shape[2], 1))
+        if self.member_bias is not None and self.member_bias.grad is not None:
+            self.member_bias.grad.mul_(scale[self.members].view(-1, 1, 1))
+
+    def _network_view(self, tensor: th.Tensor | None, layer: StackedLinear) -> th.Tensor:
+        """A parameter, or its gradient, viewed as (inputs, rows, networks per input, columns)."""
+        assert tensor is not None, "no gradient yet"
+        if layer is self.first:
+            return tensor.unflatten(-1, (self.n_networks // self.n_inputs, self.sizes[1]))
+        return tensor.unsqueeze(2)
+
+    @th.no_grad()
+    def network(self, index: int) -> nn.Sequential:
+        """
+        One network of the stack as separate ``nn.Linear`` layers (a copy).
+
+        :param index: number of the member
+        """
+        net = index if self.members is None else int(self.members[index])
+        per_input = self.n_networks // self.n_inputs
+        columns = slice(net % per_input * self.sizes[1], (net % per_input + 1) * self.sizes[1])
+        weights = [(self.first.weight[net // per_input][:, columns], self.first.bias[net // per_input, 0, columns].clone())]
+        if self.member_bias is not None:
+            weights[0][1].add_(self.member_bias[index, 0])
+        weights += [(layer.weight[net], layer.bias[net, 0]) for layer in self.rest]  # type: ignore[index]
+        layers: list[nn.Module] = []
+        for weight, bias in weights:
+            linear = nn.Linear(weight.shape[0], weight.shape[1])
+            linear.weight.copy_(weight.T)
+            linear.bias.copy_(bias)
+            layers += [linear, type(self.activation)()]
+        return nn.Sequential(*layers[:-1])

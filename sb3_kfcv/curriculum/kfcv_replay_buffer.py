@@ -1,0 +1,304 @@
+"""Curriculum replay: K-fold cross-validated difficulty, drawn from easy to hard."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from scipy.stats import spearmanr
+
+from sb3_kfcv.common.naming import unknown_name
+from sb3_kfcv.curriculum.difficulty import buckets_by_difficulty, combine_agents, cross_validated_errors
+from sb3_kfcv.curriculum.folds import assign_folds, rows_per_fold
+from sb3_kfcv.curriculum.stages import STAGE_RULES, bucket_shares, stage_at, uniform_share
+from sb3_kfcv.curriculum.teachers import Teachers
+from sb3_kfcv.replay.joint_replay_buffer import JointReplayBuffer, Student
+
+SCORES = ("teachers", "student")
+
+# Rows that are read, targeted and scored at once during a refresh: bounds its memory.
+CHUNK = 1024
+
+UNSCORED = -1
+
+
+class KFCVReplayBuffer(JointReplayBuffer):
+    """
+    K-Fold Cross Validation Curriculum Learning (KFCV-CL) over a replay buffer: section 4 and Algorithm 1 of Lin et al. 2022.
+
+    Every transition has a permanent fold. At each *refresh* K teacher critics are trained on their folds (eq. 9), every
+    transition is scored by the K − 1 teachers that have not seen it (eq. 10–11), and the transitions are ranked into K
+    buckets. The stages then draw from easy to hard (eq. 12), beside a share λ drawn uniformly from the whole buffer.
+    Before the first refresh all draws are uniform; a transition that came after the last refresh is drawn by the uniform
+    share alone; after the curriculum's share of training all draws are uniform and refreshes stop.
+
+    It knows transitions and the TD target of the learner that it is attached to, no particular algorithm.
+
+    :param n_folds: K: folds, teachers per agent, buckets and stages
+    :param refresh_every: updates between refreshes (Algorithm 1 as printed refreshes at every step, at many times the cost)
+    :param refresh_fraction: refresh sooner when this share of the buffer is new, but not before a quarter of
+        ``refresh_every``, which bounds the cost where many worlds fill a small buffer
+    :param teacher_steps: gradient steps of the teachers per refresh
+    :param first_teacher_steps: the same at the first refresh, from random networks
+    :param teacher_batch_size: transitions per teacher and step
+    :param teacher_learning_rate: of the teachers' Adam
+    :param teacher_net_arch: hidden sizes of the teachers; Table 1: 64, two layers as the student
+    :param stage_rule: ``"cumulative"``, ``"bucket"``, or the controls ``"anti"`` (hard to easy) and ``"random"``;
+        see :func:`~sb3_kfcv.curriculum.stages.bucket_shares`
+    :param lambda_init: Table 1's "initial curriculum factor λ": the uniform share at the start; 0 is section 4.2 to the letter
+    :param curriculum_fraction: share of training that the curriculum takes
+    :param score: ``"teachers"``, or the control ``"student"``: the learner's own squared TD error
+
+    The other parameters are those of :class:`~sb3_kfcv.replay.JointReplayBuffer`.
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        n_agents: int = 1,
+        state_size: int = 0,
+        seed: int | None = None,
+        n_folds: int = 5,
+        refresh_every: int = 1000,
+        refresh_fraction: float = 0.25,
+        teacher_steps: int = 50,
+        first_teacher_steps: int = 500,
+        teacher_batch_size: int = 128,
+        teacher_learning_rate: float = 1e-3,
+        teacher_net_arch: Sequence[int] = (64, 64),
+        stage_rule: str = "cumulative",
+        lambda_init: float = 0.1,
+        curriculum_fraction: float = 0.5,
+        score: str = "teachers",
+    ) -> None:
+        super().__init__(
+            buffer_size, observation_space, action_space, device, n_envs, optimize_memory_usage, n_agents, state_size, seed
+        )
+        n_rows = self.buffer_size * n_envs
+        if not 2 <= n_folds <= n_rows:
+            raise ValueError(f"n_folds must lie between 2 and the buffer's {n_rows} transitions, got {n_folds}")
+        if stage_rule not in STAGE_RULES:
+            raise ValueError(unknown_name("stage_rule", stage_rule, STAGE_RULES))
+        if score not in SCORES:
+            raise ValueError(unknown_name("score", score, SCORES))
+        for name, value in (("lambda_init", lambda_init), ("curriculum_fraction", curriculum_fraction)):
+            if not 0 <= value <= 1:
+                raise ValueError(f"{name} must lie in [0, 1], got {value}")
+        self.n_folds = n_folds
+        self.refresh_every, self.refresh_fraction = refresh_every, refresh_fraction
+        self.teacher_steps, self.first_teacher_steps = teacher_steps, first_teacher_steps
+        self.teacher_batch_size = teacher_batch_size
+        self.teacher_learning_rate, self.teacher_net_arch = teacher_learning_rate, tuple(teacher_net_arch)
+        self.stage_rule, self.score = stage_rule, score
+        self.lambda_init, self.curriculum_fraction = lambda_init, curriculum_fraction
+
+        self.folds = assign_folds(n_rows, n_folds, self.rng)  # (rows,)
+        self.scores = np.zeros(n_rows)  # (rows,) c_j of the last refresh
+        self.buckets = np.full(n_rows, UNSCORED)  # (rows,) 0 … K−1, or UNSCORED
+        self._rows_of_bucket: list[np.ndarray] | None = None  # rebuilt after rows were overwritten or scored
+        self._updates_since_refresh = 0
+        self._new_since_refresh = 0
+        self.n_refreshes = 0
+        self._stats: dict[str, Any] = {}
+        self._refresh_seconds = 0.0
+
+    @property
+    def stage(self) -> int:
+        """1 … K, and K + 1 when the curriculum is over."""
+        return stage_at(self.progress, self.curriculum_fraction, self.n_folds)
+
+    @property
+    def lambda_now(self) -> float:
+        """λ: the share of each minibatch drawn uniformly from the whole buffer."""
+        return uniform_share(self.progress, self.curriculum_fraction, self.lambda_init)
+
+    def attach(self, student: Student) -> None:
+        """
+        Meet the learner, and make its teachers.
+
+        :param student: gives critic inputs, TD targets and Q-values
+        """
+        self.student = student
+        self.teachers = Teachers(
+            self.n_folds,
+            student.n_learning_agents,
+            student.critic_input_size,
+            self.teacher_net_arch,
+            self.teacher_learning_rate,
+            self.device,
+        )
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        first = self.pos * self.n_envs
+        self.buckets[first : first + self.n_envs] = UNSCORED
+        self._rows_of_bucket = None
+        self._new_since_refresh += self.n_envs
+        super().add(*args, **kwargs)
+
+    def _draw(self, batch_size: int) -> tuple[np.ndarray, None]:
+        if self.stage <= self.n_folds:
+            self._updates_since_refresh += 1
+            if self._refresh_is_due():
+                self.refresh()
+        return self.curriculum_rows(batch_size), None
+
+    def curriculum_rows(self, batch_size: int) -> np.ndarray:
+        """
+        Draw rows by the mixture of now: λ uniform over the buffer, 1 − λ over the buckets of the stage.
+
+        The shares hold in each minibatch to within one row (systematic sampling).
+
+        :param batch_size: number of rows
+        """
+        rows = self.rng.integers(self.n_rows, size=batch_size)
+        if self.stage > self.n_folds or self.n_refreshes == 0:
+            return rows
+        members = self._bucket_members()
+        shares = bucket_shares(self.stage, self.n_folds, self.stage_rule) * [len(m) > 0 for m in members]
+        if shares.sum() == 0:  # all of the stage's transitions have been overwritten since the last refresh
+            return rows
+        shares *= (1 - self.lambda_now) / shares.sum()
+        points = (np.arange(batch_size) + self.rng.random()) / batch_size
+        source = np.searchsorted(np.cumsum(shares), points, side="right")  # bucket, or K for the uniform share
+        for bucket, rows_of in enumerate(members):
+            here = np.flatnonzero(source == bucket)
+            rows[here] = rows_of[self.rng.integers(len(rows_of), size=len(here))] if len(here) else rows[here]
+        return rows
+
+    def _bucket_members(self) -> list[np.ndarray]:
+        if self._rows_of_bucket is None:
+            self._rows_of_bucket = [np.flatnonzero(self.buckets == bucket) for bucket in range(self.n_folds)]
+        return self._rows_of_bucket
+
+    def _refresh_is_due(self) -> bool:
+        if self.n_rows < max(self.n_folds, self.teacher_batch_size):
+            return False
+        many_new = self._new_since_refresh >= self.refresh_fraction * self.buffer_size * self.n_envs
+        return (
+            self.n_refreshes == 0
+            or self._updates_since_refresh >= self.refresh_every
+            or (many_new and self._updates_since_refresh >= self.refresh_every / 4)
+        )
+
+    def refresh(self) -> None:
+        """Train the teachers, score every transition, rank them into buckets: the assessment of section 4.1."""
+        start = time.perf_counter()
+        n = self.n_rows
+        rows = np.arange(n)
+        targets, live, student_errors = self._targets(rows)
+        folds = self.folds[:n]
+
+        if self.score == "student":
+            scores = combine_agents(student_errors, live)
+        else:
+            # Targets in units of their own spread: eq. 9 has the same minimum, and few steps come near it.
+            scale = targets.std(1, keepdim=True).clamp(min=1e-6)
+            targets = (targets - targets.mean(1, keepdim=True)) / scale
+            in_fold_loss = self._train_teachers(folds, targets, live)
+            errors, values_spread = self._teacher_errors(rows, targets)
+            scores = combine_agents(errors, live)
+            held_out = (errors * live).sum() / live.sum().clamp(min=1) / (self.n_folds - 1)
+            self._stats["curriculum/teacher_loss_in_fold"] = in_fold_loss
+            self._stats["curriculum/teacher_loss_held_out"] = held_out.item()
+            self._stats["curriculum/teacher_disagreement"] = values_spread
+        if self.stage_rule == "random":
+            scores = self.rng.random(n)
+
+        known = self.buckets[:n] != UNSCORED
+        if known.sum() > 1:
+            self._stats["curriculum/rank_correlation_with_last"] = rank_correlation(self.scores[:n][known], scores[known])
+        student_scores = combine_agents(student_errors, live)
+        self._stats["curriculum/rank_correlation_with_student"] = rank_correlation(scores, student_scores)
+        self.scores[:n] = scores
+        self.buckets[:n] = buckets_by_difficulty(scores, self.n_folds)
+        self._rows_of_bucket = None
+        self._updates_since_refresh = self._new_since_refresh = 0
+        self.n_refreshes += 1
+        self._refresh_seconds += time.perf_counter() - start
+
+    def _targets(self, rows: np.ndarray) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """y, liveness, and the student's squared TD errors of all rows, each (agents, n)."""
+        parts = []
+        for chunk in np.array_split(rows, -(-len(rows) // CHUNK)):
+            batch = self.rows(chunk)
+            target = self.student.td_target(batch)
+            error = (target - self.student.q_values(self.student.critic_inputs(batch))).square()
+            parts.append((target, self.student.live(batch), error))
+        targets, live, errors = (th.cat(part, dim=1) for part in zip(*parts, strict=True))
+        return targets, live, errors
+
+    def _train_teachers(self, folds: np.ndarray, targets: th.Tensor, live: th.Tensor) -> float:
+        def read(rows: np.ndarray) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+            picked = th.as_tensor(rows, device=self.device)
+            return self.student.critic_inputs(self.rows(rows)), targets[:, picked], live[:, picked]
+
+        steps = self.teacher_steps if self.n_refreshes else self.first_teacher_steps
+        return self.teachers.fit(rows_per_fold(folds, self.n_folds), read, steps, self.teacher_batch_size, self.rng)
+
+    @th.no_grad()
+    def _teacher_errors(self, rows: np.ndarray, targets: th.Tensor) -> tuple[th.Tensor, float]:
+        """Summed squared errors of the teachers that have not seen each row (agents, n), and how far they disagree."""
+        errors, spreads = [], []
+        for chunk in np.array_split(rows, -(-len(rows) // CHUNK)):
+            values = self.teachers.values(self.student.critic_inputs(self.rows(chunk)).unsqueeze(0))
+            folds = th.as_tensor(self.folds[chunk], device=self.device)
+            errors.append(cross_validated_errors(targets[:, chunk[0] : chunk[-1] + 1], values, folds))
+            spreads.append(values.std(0).mean())
+        return th.cat(errors, dim=1), th.stack(spreads).mean().item()
+
+    def diagnostics(self) -> dict[str, Any]:
+        """Stage, λ, shares, score quantiles per bucket, the teachers' losses, rank correlations, and the scores themselves."""
+        stats: dict[str, Any] = {
+            **self._stats,
+            "curriculum/stage": self.stage,
+            "curriculum/lambda": self.lambda_now,
+            "curriculum/refreshes": self.n_refreshes,
+            "time/refresh_seconds": self._refresh_seconds,
+        }
+        if self.n_refreshes == 0:
+            return stats
+        over = self.stage > self.n_folds
+        shares = bucket_shares(self.stage, self.n_folds, self.stage_rule) * (0 if over else 1 - self.lambda_now)
+        for bucket, rows in enumerate(self._bucket_members()):
+            stats[f"curriculum/share_bucket_{bucket + 1}"] = shares[bucket]
+            if len(rows):
+                low, median, high = np.quantile(self.scores[rows], [0.1, 0.5, 0.9])
+                stats[f"curriculum/score_bucket_{bucket + 1}_q10"] = low
+                stats[f"curriculum/score_bucket_{bucket + 1}_q50"] = median
+                stats[f"curriculum/score_bucket_{bucket + 1}_q90"] = high
+        stats["curriculum/unscored"] = float(np.mean(self.buckets[: self.n_rows] == UNSCORED))
+        stats["curriculum/scores"] = th.as_tensor(self.scores[: self.n_rows])
+        return stats
+
+    def state_arrays(self) -> dict[str, np.ndarray]:
+        clock = [self._updates_since_refresh, self._new_since_refresh, self.n_refreshes]
+        teachers = {f"teacher.{name}": value.cpu().numpy() for name, value in self.teachers.state_dict().items()}
+        rows = {"folds": self.folds, "scores": self.scores, "buckets": self.buckets}
+        return {**super().state_arrays(), **rows, "refresh_clock": np.array(clock), **teachers}
+
+    def load_state_arrays(self, arrays: dict[str, np.ndarray]) -> None:
+        if "folds" in arrays and arrays["folds"].shape != self.folds.shape:
+            raise ValueError(f"not a replay buffer of this model: {len(arrays['folds'])} rows, here {len(self.folds)}")
+        super().load_state_arrays(arrays)
+        self.folds, self.scores, self.buckets = (arrays[name].copy() for name in ("folds", "scores", "buckets"))
+        self._updates_since_refresh, self._new_since_refresh, self.n_refreshes = (int(n) for n in arrays["refresh_clock"])
+        self._rows_of_bucket = None
+        self.teachers.load_state_dict(
+            {name.removeprefix("teacher."): th.as_tensor(array) for name, array in arrays.items() if "teacher." in name}
+        )
+
+
+def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:
+    """Spearman's ρ; 0 where one of them is constant."""
+    if np.ptp(first) == 0 or np.ptp(second) == 0:
+        return 0.0
+    return float(spearmanr(first, second).statistic)

@@ -1,0 +1,79 @@
+"""What the learner shows of itself, at no cost to the updates: tensors are kept as they fall and read when logged."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING
+
+import torch as th
+
+from sb3_kfcv.common.layout import AgentLayout
+
+if TYPE_CHECKING:
+    from sb3_kfcv.maddpg.policies import StackedActors, StackedCritics
+
+# Logged values are means over this many of the latest updates.
+WINDOW = 100
+
+# A continuous action beyond this share of its range counts as saturated.
+SATURATED = 0.95
+
+
+class Diagnostics:
+    """
+    The latest losses, Q-values and actions of a MADDPG learner.
+
+    :param layout: who sits where
+    :param agents: the learning agents
+    """
+
+    def __init__(self, layout: AgentLayout, agents: list[int]) -> None:
+        self._continuous = not layout.discrete
+        groups = [layout.groups[i] for i in agents]
+        self._positions = {group: [p for p, g in enumerate(groups) if g == group] for group in dict.fromkeys(groups)}
+        self._critic_losses: deque[th.Tensor] = deque(maxlen=WINDOW)  # each (agents,)
+        self._targets: deque[th.Tensor] = deque(maxlen=WINDOW)  # each (agents, batch)
+        self._actor_losses: deque[th.Tensor] = deque(maxlen=WINDOW)  # each (agents,)
+        self._own_actions: list[th.Tensor] = []
+        self.update_seconds = 0.0
+
+    def critics(self, losses: th.Tensor, targets: th.Tensor) -> None:
+        """Note an update of the critics: losses (critics, agents), TD targets (agents, batch)."""
+        self._critic_losses.append(losses.detach().mean(0))
+        self._targets.append(targets)
+
+    def actors(self, losses: th.Tensor, own_actions: list[th.Tensor]) -> None:
+        """Note an update of the actors: losses (agents,), their actions per block (agents, batch, action)."""
+        self._actor_losses.append(losses.detach())
+        self._own_actions = [actions.detach() for actions in own_actions]
+
+    def series(self, actor: StackedActors, critic: StackedCritics) -> dict[str, float]:
+        """
+        Name → value of everything to log; losses and Q-values per group, gradient norms of the latest update.
+
+        :param actor: the actors, with the gradients of their latest update
+        :param critic: the critics, likewise
+        """
+        values: dict[str, float] = {"time/update_seconds": self.update_seconds}
+        if self._critic_losses:
+            self._per_group(values, "train/critic_loss", th.stack(tuple(self._critic_losses)))
+            self._per_group(values, "train/q_target", th.stack(tuple(target.mean(-1) for target in self._targets)))
+            values["train/critic_grad_norm"] = _mean_norm(critic)
+        if self._actor_losses:
+            self._per_group(values, "train/actor_loss", th.stack(tuple(self._actor_losses)))
+            values["train/actor_grad_norm"] = _mean_norm(actor)
+            if self._continuous:
+                saturated = th.cat([(actions.abs() > SATURATED).float().flatten() for actions in self._own_actions])
+                values["train/action_saturation"] = saturated.mean().item()
+        return values
+
+    def _per_group(self, values: dict[str, float], key: str, stacked: th.Tensor) -> None:
+        """Add the mean of ``stacked`` (time, agents) over all learning agents, and over each group where there are several."""
+        values[key] = stacked.mean().item()
+        if len(self._positions) > 1:
+            for group, positions in self._positions.items():
+                values[f"{key}_{group}"] = stacked[:, positions].mean().item()
+
+
+def _mean_norm(networks: StackedActors | StackedCritics) -> float:
+    return th.cat([stack.gradient_norms() for stack in networks.stacks]).mean().item()  # type: ignore[operator]

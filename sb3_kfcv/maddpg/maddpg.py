@@ -1,0 +1,494 @@
+from __future__ import annotations
+
+import io
+import pathlib
+import time
+from collections import deque
+from collections.abc import Iterable
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import polyak_update, safe_mean
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_kfcv.common.files import atomic_write, with_suffix
+from sb3_kfcv.common.naming import unknown_name
+from sb3_kfcv.common.team_policy import TeamPolicy
+from sb3_kfcv.maddpg.diagnostics import Diagnostics
+from sb3_kfcv.maddpg.policies import MADDPGPolicy, MlpPolicy, StackedActors, StackedCritics
+from sb3_kfcv.replay import JointReplayBuffer, JointReplayBufferSamples
+from sb3_kfcv.vec_env.make import layout_of, wrap_env
+
+SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
+
+# Log formats that cannot show a histogram.
+NOT_TENSORBOARD = ("stdout", "log", "json", "csv")
+
+
+class MADDPG(OffPolicyAlgorithm):
+    """
+    Multi-Agent Deep Deterministic Policy Gradient (Lowe et al. 2017; eq. 5–6 and Algorithm 1 of Lin et al. 2022).
+
+    Every agent has an actor that sees its own observation and a critic that sees all observations and actions.
+    One joint minibatch serves all agents of an update. Defaults are Table 1 of Lin et al.
+
+    The world is one slot of the env: a joint observation row, a joint action row, per-agent rewards in the infos
+    (see :class:`~sb3_kfcv.vec_env.joint_env.JointEnv`). A PettingZoo parallel env is wrapped by itself.
+
+    :param policy: ``"MlpPolicy"`` or a subclass of :class:`MADDPGPolicy`
+    :param env: a gym id such as ``"Grassland-v0"``, a PettingZoo ``ParallelEnv``, a joint env, or a ``VecEnv`` of such
+    :param learning_rate: of actors and critics; a number or a schedule of the remaining progress
+    :param buffer_size: joint transitions held
+    :param learning_starts: env steps with random actions before learning (Table 1 is silent; a fifth of its buffer)
+    :param batch_size: joint transitions per update
+    :param tau: update rate of the target networks
+    :param gamma: discount factor
+    :param train_freq: steps of the vec env between trainings, or ``(n, "episode")``; Algorithm 1 trains every step
+    :param gradient_steps: updates per training; −1 makes as many as env steps were taken
+    :param action_noise: exploration noise on the joint action in [-1, 1]; by default Gaussian with ``exploration_noise``
+    :param exploration_noise: standard deviation of the default noise; discrete agents draw from their softmax instead
+    :param replay_buffer_class: by default the one of the algorithm
+    :param replay_buffer_kwargs: settings of the replay buffer
+    :param optimize_memory_usage: not supported
+    :param critic_input: ``"observations"`` (all agents', as in the paper) or ``"state"`` (the world's ``state()``, which
+        makes the critics' first layer many times smaller where the world is fully observable)
+    :param share_parameters: one actor and one critic per group of agents instead of per agent; members of a group are
+        told apart by a learnt bias, which is what a one-hot index in the input amounts to
+    :param team: learn only the agents of this group; the others act by ``opponents``
+    :param opponents: with ``team``: for each other group the name of a scripted policy, or anything with ``predict`` on
+        joint rows, such as a trained model
+    :param policy_delay: updates of the critics per update of actors and targets (TD3: 2, against chasing a poor critic)
+    :param target_policy_noise: noise on the target actions (TD3: 0.2, smooths sharp peaks of the critics)
+    :param target_noise_clip: bound of that noise
+    :param max_grad_norm: clip each network's gradient to this norm (MADDPG's own code: 0.5; large rewards spike)
+    :param reward_scale: factor on the rewards that the critics learn (large returns make large critic gradients)
+    :param actor_regularization: weight of the mean squared actor output before its tanh, or of the logits (MADDPG's own
+        code: 1e-3; keeps actions from saturating where their gradient vanishes)
+    :param gumbel_temperature: of the Gumbel-softmax of discrete agents
+    :param stats_window_size: episodes over which the logged rollout statistics are averaged
+    :param tensorboard_log: folder of the TensorBoard log
+    :param policy_kwargs: ``net_arch``, ``activation_fn``, ``n_critics`` (2: the lower of two target critics counts, as in
+        TD3, against over-estimation), ``optimizer_class``, ``optimizer_kwargs``
+    :param verbose: 0 none, 1 info, 2 debug
+    :param seed: of networks, noise, replay and env
+    :param device: ``"auto"``, ``"cpu"``, ``"cuda"``
+    :param _init_setup_model: whether to build the networks at once
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
+    default_buffer_class: ClassVar[type[JointReplayBuffer]] = JointReplayBuffer
+    policy: MADDPGPolicy
+    replay_buffer: JointReplayBuffer
+    actor: StackedActors
+    actor_target: StackedActors
+    critic: StackedCritics
+    critic_target: StackedCritics
+
+    def __init__(
+        self,
+        policy: str | type[MADDPGPolicy],
+        env: GymEnv | str | Any,
+        learning_rate: float | Schedule = 1e-3,
+        buffer_size: int = 5000,
+        learning_starts: int = 1000,
+        batch_size: int = 128,
+        tau: float = 0.01,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        exploration_noise: float = 0.1,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        critic_input: str = "observations",
+        share_parameters: bool = False,
+        team: str | None = None,
+        opponents: dict[str, Any] | None = None,
+        policy_delay: int = 1,
+        target_policy_noise: float = 0.0,
+        target_noise_clip: float = 0.5,
+        max_grad_norm: float | None = None,
+        reward_scale: float = 1.0,
+        actor_regularization: float = 0.0,
+        gumbel_temperature: float = 1.0,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class or self.default_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box, spaces.MultiDiscrete),
+            support_multi_env=True,
+        )
+        self.exploration_noise = exploration_noise
+        self.critic_input = critic_input
+        self.share_parameters = share_parameters
+        self.team = team
+        self.opponents = opponents
+        self.policy_delay = policy_delay
+        self.target_policy_noise = target_policy_noise
+        self.target_noise_clip = target_noise_clip
+        self.max_grad_norm = max_grad_norm
+        self.reward_scale = reward_scale
+        self.actor_regularization = actor_regularization
+        self.gumbel_temperature = gumbel_temperature
+        if self.env is not None:
+            self.layout = layout_of(self.env)
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._check_settings()
+        layout = self.layout
+        self.agents = list(layout.members(self.team) if self.team else range(layout.n_agents))
+        self.n_learning_agents = len(self.agents)
+        self._agent_of_column = [i for i, size in enumerate(layout.action_sizes) for _ in range(size)]
+        self._opponent_policy = self._make_opponent_policy()
+        state_size = layout.state_size if self.critic_input == "state" else 0
+        self.critic_input_size = (state_size or sum(layout.obs_sizes)) + sum(layout.action_sizes)
+        if self.action_noise is None and not layout.discrete and self.exploration_noise > 0:
+            size = sum(layout.action_sizes)
+            self.action_noise = NormalActionNoise(np.zeros(size), np.full(size, self.exploration_noise), dtype=np.float32)
+
+        users_kwargs = self.policy_kwargs, self.replay_buffer_kwargs
+        self.policy_kwargs = {
+            "layout": layout,
+            "agents": self.agents,
+            "critic_input_size": self.critic_input_size,
+            "share_parameters": self.share_parameters,
+            **self.policy_kwargs,
+        }
+        self.replay_buffer_kwargs = {
+            "n_agents": layout.n_agents,
+            "state_size": state_size,
+            "seed": self.seed,
+            **self.replay_buffer_kwargs,
+        }
+        super()._setup_model()
+        self.policy_kwargs, self.replay_buffer_kwargs = users_kwargs
+        self._create_aliases()
+        self._watch = Diagnostics(layout, self.agents)
+        self._episode_metrics: deque[dict[str, float]] = deque(maxlen=self._stats_window_size)
+        self.replay_buffer.attach(self)
+
+    def _check_settings(self) -> None:
+        """Refuse what cannot train, before anything is built."""
+        layout = self.layout
+        if self.critic_input not in ("observations", "state"):
+            raise ValueError(unknown_name("critic_input", self.critic_input, ["observations", "state"]))
+        if self.critic_input == "state" and not layout.state_size:
+            raise ValueError('critic_input="state" needs a world that has a state(); this one has none')
+        for name in ("buffer_size", "batch_size", "policy_delay"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 1:
+                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+        if self.batch_size > self.buffer_size:
+            raise ValueError(f"batch_size={self.batch_size} is larger than buffer_size={self.buffer_size}")
+        if self.opponents and not self.team:
+            raise ValueError("opponents are for a model that learns one group; say which with team=")
+        if self.team and self._vec_normalize_env is not None:
+            raise ValueError("team= does not work under VecNormalize: the opponents need the observations as they are")
+
+    def _make_opponent_policy(self) -> TeamPolicy | None:
+        others = [group for group in self.layout.group_names if self.team and group != self.team]
+        if not others:
+            return None
+        return TeamPolicy(self.layout, self.opponents or {}, np.random.default_rng(self.seed), groups=others)
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor
+        self.actor_target = self.policy.actor_target
+        self.critic = self.policy.critic
+        self.critic_target = self.policy.critic_target
+
+    def train(self, gradient_steps: int, batch_size: int = 128) -> None:
+        start = time.perf_counter()
+        self.policy.set_training_mode(True)
+        self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])  # type: ignore[list-item]
+        self.replay_buffer.progress = 1 - self._current_progress_remaining
+
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            # Algorithm 1: "Sampling a minibatch of experience quadruples from D"
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            live = self.live(batch)  # (agents, batch): a dead agent's rows enter no loss
+
+            # Eq. 5: minimise (y − Q)², y = r + γ Q'(s', a'_1 … a'_N)
+            inputs = self.critic_inputs(batch)
+            targets = self.td_target(batch)  # (agents, batch)
+            errors = targets - self.critic(inputs)  # (critics, agents, batch)
+            critic_losses = live_mean(errors.square() * batch.weights, live)  # (critics, agents)
+            self._minimise(self.critic, critic_losses.sum())
+
+            # Eq. 6: ascend Q(s, a_1 … π_i(o_i) … a_N)
+            if self._n_updates % self.policy_delay == 0:
+                own_actions, raw = self.actor.relaxed(batch.observations, self.gumbel_temperature)
+                actor_losses = -live_mean(self.critic.with_own_actions(inputs, own_actions), live)  # (agents,)
+                penalty = self.actor_regularization * sum(output.square().mean((1, 2)).sum() for output in raw)
+                self._minimise(self.actor, actor_losses.sum() + penalty)
+                self._watch.actors(actor_losses, own_actions)
+
+                # θ' ← τθ + (1 − τ)θ'
+                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+                polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+
+            self.replay_buffer.update_priorities(batch.rows, live_mean(errors[0].detach().abs().T, live.T))
+            self._watch.critics(critic_losses, targets)
+
+        self._watch.update_seconds += time.perf_counter() - start
+
+    @th.no_grad()
+    def td_target(self, batch: JointReplayBufferSamples) -> th.Tensor:
+        """
+        y = r + γ Q'(s', a'_1 … a'_N) with a'_i = π'_i(o'_i) (eq. 5 and 10); without the second term for an agent that died
+        or whose world ended, with it at a time limit.
+
+        :return: (agents, batch), the learning agents
+        """
+        next_alive = batch.alive * (1 - batch.dones)
+        next_actions = self._target_actions(batch.next_observations)
+        next_inputs = self._critic_inputs(batch.next_observations, batch.next_states, next_actions, next_alive)
+        next_q_values = self.critic_target(next_inputs).amin(0)
+        continues = 1 - batch.dones.T[self.agents]
+        return self.reward_scale * batch.rewards.T[self.agents] + self.gamma * continues * next_q_values
+
+    def critic_inputs(self, batch: JointReplayBufferSamples) -> th.Tensor:
+        """(batch, features): all observations, or the world's state, and then all actions; a dead agent's action is 0."""
+        return self._critic_inputs(batch.observations, batch.states, self.policy.encode(batch.actions), batch.alive)
+
+    @th.no_grad()
+    def q_values(self, inputs: th.Tensor) -> th.Tensor:
+        """(agents, batch): each learning agent's first critic on :meth:`critic_inputs`."""
+        return self.critic(inputs)[0]
+
+    def live(self, batch: JointReplayBufferSamples) -> th.Tensor:
+        """(agents, batch): 1 where the learning agent lived at the start of the step."""
+        return batch.alive.T[self.agents]
+
+    def _critic_inputs(self, observations: th.Tensor, states: th.Tensor, actions: th.Tensor, alive: th.Tensor) -> th.Tensor:
+        seen = states if self.critic_input == "state" else observations
+        return th.cat([seen, actions * alive[:, self._agent_of_column]], dim=1)
+
+    def _target_actions(self, observations: th.Tensor) -> th.Tensor:
+        """(batch, joint action): a' of all agents, the learning ones by their target actors."""
+        actions = self.policy.joint_actions(self.actor_target, observations)
+        if self.target_policy_noise > 0 and not self.layout.discrete:
+            noise = th.randn_like(actions).mul_(self.target_policy_noise)
+            actions = (actions + noise.clamp_(-self.target_noise_clip, self.target_noise_clip)).clamp_(-1, 1)
+        if self._opponent_policy is not None:
+            rows = observations.cpu().numpy()
+            others = self._opponent_policy.fill(self.policy.to_env(actions), rows)
+            actions = self.policy.encode(th.as_tensor(self.policy.from_env(others), device=self.device))
+        return actions
+
+    def _minimise(self, networks: StackedActors | StackedCritics, loss: th.Tensor) -> None:
+        networks.optimizer.zero_grad()
+        loss.backward()
+        if self.max_grad_norm is not None:
+            for stack in networks.stacks:
+                stack.clip_gradients(self.max_grad_norm)
+        networks.optimizer.step()
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: tuple[np.ndarray, ...] | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+        """
+        The joint action row, as in SB3; with ``team``, the other groups' part comes from their opponents.
+
+        :param observation: joint row (joint,) or rows (batch, joint)
+        :param state: not used
+        :param episode_start: not used
+        :param deterministic: discrete agents take their best action instead of a draw
+        """
+        actions, state = super().predict(observation, state, episode_start, deterministic)
+        if self._opponent_policy is not None:
+            actions = self._opponent_policy.fill(actions, np.asarray(observation), deterministic)
+        return actions, state
+
+    def predict_agent(self, agent: str, observation: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        """
+        One agent's action from its own observation alone: decentralised execution.
+
+        :param agent: name of a learning agent, such as ``"wolf_0"``
+        :param observation: (obs,) or (batch, obs)
+        :param deterministic: a discrete agent takes its best action instead of a draw
+        :return: its action in its own action space
+        :raises ValueError: for an agent that the world lacks or that this model does not learn
+        """
+        if agent not in self.layout.agents:
+            raise ValueError(unknown_name("agent", agent, self.layout.agents))
+        return self.policy.predict_agent(agent, observation, deterministic)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        action, buffer_action = super()._sample_action(learning_starts, action_noise, n_envs)
+        if self._opponent_policy is not None:  # neither the warm-up nor the noise is for the opponents
+            action = self._opponent_policy.fill(action, self._last_obs, deterministic=False)
+            buffer_action = self.policy.from_env(action)
+        return action, buffer_action
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        for info in infos:
+            if "episode_metrics" in info:
+                self._episode_metrics.append(info["episode_metrics"])
+
+    def dump_logs(self) -> None:
+        """Write the log: SB3's series, every episode metric of the world, the learner's and the replay's diagnostics."""
+        for key in self._episode_metrics[0] if self._episode_metrics else ():
+            self.logger.record(f"rollout/{key}", safe_mean([episode[key] for episode in self._episode_metrics]))
+        for key, value in {**self._watch.series(self.actor, self.critic), **self.replay_buffer.diagnostics()}.items():
+            self.logger.record(key, value, exclude=NOT_TENSORBOARD if isinstance(value, th.Tensor) else None)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        super().dump_logs()
+
+    def learn(
+        self: SelfMADDPG,
+        total_timesteps: int = 100_000,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfMADDPG:
+        """
+        Learn; as in SB3, with a default length.
+
+        :param total_timesteps: env steps, summed over the worlds of the vec env
+        :param callback: called at every step
+        :param log_interval: episodes between log entries; ``None`` logs nothing
+        :param tb_log_name: name of the run in the TensorBoard folder; by default the algorithm's
+        :param reset_num_timesteps: start counting anew
+        :param progress_bar: show progress and time left
+        """
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name or type(self).__name__,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        return OffPolicyAlgorithm._wrap_env(wrap_env(env, monitor_wrapper), verbose, monitor_wrapper)
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfMADDPG], path: str | pathlib.Path | io.BufferedIOBase, env: Any = None, **kwargs: Any
+    ) -> SelfMADDPG:
+        """
+        Load a model, as in SB3; ``env`` may be anything that the constructor takes.
+
+        :param path: of the zip file
+        :param env: the world to go on in; ``None`` if only predictions are wanted
+        :param kwargs: see ``BaseAlgorithm.load``; other names replace saved settings, such as ``opponents``
+        :raises ValueError: if the env's agents are not those that the model was trained for
+        """
+        env = None if env is None else cls._wrap_env(maybe_make_env(env, 0), 0)
+        try:
+            model = super().load(path, env, **kwargs)
+        except ValueError as error:
+            if "spaces do not match" not in str(error):
+                raise
+            raise ValueError(f"the model in {path} was trained for another world than the env given: {error}") from None
+        if env is not None and layout_of(env) != model.layout:
+            raise ValueError(f"the model in {path} is for {model.layout}; the env given has {layout_of(env)}")
+        return model
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save the model, as in SB3, but never half: the file appears when it is whole, and an older one stays until then.
+
+        :param path: of the zip file (the ending is added), or an open file
+        :param exclude: names of attributes to leave out
+        :param include: names of attributes to keep that are left out by default
+        """
+        if isinstance(path, (str, pathlib.Path)):
+            with atomic_write(with_suffix(path, ".zip")) as file:
+                super().save(file, exclude, include)
+        else:
+            super().save(path, exclude, include)
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        Save the replay buffer as an ``.npz`` of plain arrays.
+
+        :param path: of the file (the ending is added), or an open file
+        """
+        if isinstance(path, (str, pathlib.Path)):
+            with atomic_write(with_suffix(path, ".npz")) as file:
+                np.savez(file, **self.replay_buffer.state_arrays())
+        else:
+            np.savez(path, **self.replay_buffer.state_arrays())
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Fill the replay buffer from a file of :meth:`save_replay_buffer`.
+
+        :param path: of the file (the ending is added), or an open file
+        :param truncate_last_traj: not used
+        :raises ValueError: if the file is of another buffer
+        """
+        source = with_suffix(path, ".npz") if isinstance(path, (str, pathlib.Path)) else path
+        with np.load(source, allow_pickle=False) as arrays:
+            self.replay_buffer.load_state_arrays(dict(arrays))
+
+    def _excluded_save_params(self) -> list[str]:
+        excluded = ["actor", "actor_target", "critic", "critic_target", "_watch", "_opponent_policy"]
+        if any(not isinstance(player, str) for player in (self.opponents or {}).values()):
+            excluded.append("opponents")  # models are saved in their own files and given again to load()
+        return super()._excluded_save_params() + excluded
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "actor.optimizer", "critic.optimizer"], []
+
+
+def live_mean(values: th.Tensor, live: th.Tensor) -> th.Tensor:
+    """Mean over the last axis of the entries where ``live`` is 1 (0 where none is)."""
+    return (values * live).sum(-1) / live.sum(-1).clamp(min=1.0)

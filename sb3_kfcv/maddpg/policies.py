@@ -1,0 +1,371 @@
+"""Actors and centralised critics of all agents, as stacks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import get_actor_critic_arch
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from torch import nn
+from torch.nn import functional as F
+
+from sb3_kfcv.common.layout import AgentLayout
+from sb3_kfcv.common.stacked_networks import StackedMLP
+
+
+class Block:
+    """
+    Agents whose observations and actions have equal sizes, so that their actors stack.
+
+    :param agents: indices of the agents in the layout
+    """
+
+    def __init__(self, layout: AgentLayout, agents: Sequence[int]) -> None:
+        self.agents = list(agents)
+        self.obs_size = layout.obs_sizes[agents[0]]
+        self.action_size = layout.action_sizes[agents[0]]
+        self.obs_columns = _Columns([layout.obs_slices[i] for i in agents])
+        self.action_columns = _Columns([layout.action_slices[i] for i in agents])
+
+    @staticmethod
+    def split(layout: AgentLayout, agents: Sequence[int]) -> list[Block]:
+        """The blocks of some agents, in order of first appearance."""
+        shapes: dict[tuple[int, int], list[int]] = {}
+        for i in agents:
+            shapes.setdefault((layout.obs_sizes[i], layout.action_sizes[i]), []).append(i)
+        return [Block(layout, members) for members in shapes.values()]
+
+
+class _Columns:
+    """Equal-sized column ranges of a joint row, read and written as (agents, batch, size); a view where they adjoin."""
+
+    def __init__(self, slices: Sequence[slice]) -> None:
+        self.count = len(slices)
+        self.index = th.tensor([list(range(s.start, s.stop)) for s in slices])  # (agents, size)
+        flat = self.index.flatten()
+        adjoin = bool((flat == th.arange(len(flat)) + flat[0]).all())
+        self.range: slice | th.Tensor = slice(int(flat[0]), int(flat[-1]) + 1) if adjoin else flat
+
+    def read(self, rows: th.Tensor) -> th.Tensor:
+        """(batch, joint) → (agents, batch, size)."""
+        return rows[:, self.range].unflatten(1, (self.count, -1)).transpose(0, 1)
+
+    def write(self, rows: th.Tensor, values: th.Tensor) -> None:
+        """Put (agents, batch, size) into (batch, joint)."""
+        rows[:, self.range] = values.transpose(0, 1).flatten(1)
+
+
+class StackedActors(nn.Module):
+    """
+    The learning agents' deterministic policies π_i(o_i), each seeing its own observation alone.
+
+    Continuous agents end in a tanh (actions in [-1, 1]); discrete ones give logits.
+
+    :param layout: who sits where in the joint rows
+    :param agents: the learning agents
+    :param net_arch: hidden sizes
+    :param activation_fn: activation between layers
+    :param share_parameters: one network per group of agents instead of one per agent
+    """
+
+    optimizer: th.optim.Optimizer
+
+    def __init__(
+        self,
+        layout: AgentLayout,
+        agents: Sequence[int],
+        net_arch: list[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+        share_parameters: bool = False,
+    ) -> None:
+        super().__init__()
+        self.layout = layout
+        self.blocks = Block.split(layout, agents)
+        self.stacks = nn.ModuleList()
+        for block in self.blocks:
+            members = shared_members(layout, block.agents) if share_parameters else None
+            n_networks = max(members) + 1 if members else len(block.agents)
+            sizes = [block.obs_size, *net_arch, block.action_size]
+            self.stacks.append(StackedMLP(n_networks, sizes, activation_fn, members=members))
+
+    def outputs(self, observations: th.Tensor) -> list[th.Tensor]:
+        """
+        :param observations: joint rows (batch, joint)
+        :return: per block (agents, batch, action): what the last layers give, before the tanh or the choice
+        """
+        return [stack(block.obs_columns.read(observations)) for stack, block in zip(self.stacks, self.blocks, strict=True)]
+
+    def forward(self, observations: th.Tensor, explore: bool = False) -> list[th.Tensor]:
+        """
+        The actions as a critic sees them; the choice of a discrete agent has no gradient.
+
+        :param observations: joint rows (batch, joint)
+        :param explore: discrete agents draw from their softmax instead of taking its maximum
+        :return: per block (agents, batch, action)
+        """
+        outputs = self.outputs(observations)
+        if not self.layout.discrete:
+            return [th.tanh(output) for output in outputs]
+        if explore:
+            outputs = [gumbel_perturbed(logits) for logits in outputs]
+        return [F.one_hot(logits.argmax(-1), logits.shape[-1]).to(logits.dtype) for logits in outputs]
+
+    def relaxed(self, observations: th.Tensor, temperature: float) -> tuple[list[th.Tensor], list[th.Tensor]]:
+        """
+        Actions that carry a gradient: as they are, or straight-through Gumbel-softmax for discrete agents.
+
+        :param temperature: of the Gumbel-softmax
+        :return: the actions, per block (agents, batch, action), and the raw outputs that they come from
+        """
+        outputs = self.outputs(observations)
+        if not self.layout.discrete:
+            return [th.tanh(output) for output in outputs], outputs
+        return [F.gumbel_softmax(logits, tau=temperature, hard=True) for logits in outputs], outputs
+
+    def network(self, agent: int) -> nn.Sequential:
+        """The network of one agent, as separate ``nn.Linear`` layers (a copy; its last layer is linear)."""
+        for stack, block in zip(self.stacks, self.blocks, strict=True):
+            if agent in block.agents:
+                return stack.network(block.agents.index(agent))  # type: ignore[operator]
+        raise ValueError(f"{self.layout.agents[agent]!r} is not among the learning agents")
+
+
+class StackedCritics(nn.Module):
+    """
+    The learning agents' centralised critics Q_i(s, a_1 … a_N), all reading the same joint input.
+
+    :param layout: who sits where in the joint rows
+    :param agents: the learning agents
+    :param input_size: length of the input: all observations, or the world's state, and then the joint action
+    :param net_arch: hidden sizes
+    :param activation_fn: activation between layers
+    :param n_critics: critics per agent (2 for clipped double Q-learning)
+    :param share_parameters: one critic per group of agents instead of one per agent
+    """
+
+    optimizer: th.optim.Optimizer
+
+    def __init__(
+        self,
+        layout: AgentLayout,
+        agents: Sequence[int],
+        input_size: int,
+        net_arch: list[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+        n_critics: int = 1,
+        share_parameters: bool = False,
+    ) -> None:
+        super().__init__()
+        self.actions_start = input_size - sum(layout.action_sizes)
+        self.blocks = Block.split(layout, agents)
+        self.positions = [th.tensor([list(agents).index(i) for i in block.agents]) for block in self.blocks]
+        members = shared_members(layout, agents) if share_parameters else None
+        n_networks = max(members) + 1 if members else len(agents)
+        sizes = [input_size, *net_arch, 1]
+        self.stacks = nn.ModuleList(
+            StackedMLP(n_networks, sizes, activation_fn, n_inputs=1, members=members) for _ in range(n_critics)
+        )
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: (batch, observations or state, then joint action)
+        :return: Q-values (critics, agents, batch)
+        """
+        return th.stack([stack(inputs.unsqueeze(0)).squeeze(-1) for stack in self.stacks])
+
+    def with_own_actions(self, inputs: th.Tensor, own_actions: list[th.Tensor]) -> th.Tensor:
+        """
+        Q_i of each agent's first critic with the agent's own action replaced and all others as they are (eq. 6).
+
+        The first layer of all critics is computed once; an agent's new action moves its pre-activation by
+        (new − old) · (its own action columns). Gradients reach ``own_actions`` alone.
+
+        :param inputs: (batch, observations or state, then joint action)
+        :param own_actions: per block (agents, batch, action)
+        :return: (agents, batch)
+        """
+        stack: StackedMLP = self.stacks[0]  # type: ignore[assignment]
+        with th.no_grad():
+            z = stack.first_layer(inputs.unsqueeze(0))  # (agents, batch, hidden)
+        moved = []
+        for block, positions, new in zip(self.blocks, self.positions, own_actions, strict=True):
+            old = block.action_columns.read(inputs[:, self.actions_start :])
+            own_columns = stack.input_columns(positions, self.actions_start + block.action_columns.index)
+            moved.append(th.baddbmm(z[positions] if len(self.blocks) > 1 else z, new - old, own_columns))
+        if len(self.blocks) > 1:
+            moved = [th.cat(moved)[th.cat(self.positions).argsort()]]
+        return stack.after_first_layer(moved[0], frozen=True).squeeze(-1)
+
+    def network(self, position: int, critic: int = 0) -> nn.Sequential:
+        """One critic as separate ``nn.Linear`` layers (a copy); ``position`` counts the learning agents."""
+        return self.stacks[critic].network(position)  # type: ignore[operator]
+
+
+def shared_members(layout: AgentLayout, agents: Sequence[int]) -> list[int]:
+    """Which network each agent uses when one network serves a group: 0 for the first group met, 1 for the next, …"""
+    groups = list(dict.fromkeys(layout.groups[i] for i in agents))
+    return [groups.index(layout.groups[i]) for i in agents]
+
+
+class MADDPGPolicy(BasePolicy):
+    """
+    Policy of MADDPG: actors, centralised critics, and the target networks of both.
+
+    :param observation_space: joint observation space
+    :param action_space: joint action space, ``Box`` or ``MultiDiscrete``
+    :param lr_schedule: learning rate of actors and critics
+    :param layout: who sits where in the joint rows; set by the algorithm
+    :param agents: the learning agents; set by the algorithm
+    :param critic_input_size: length of the critics' input; set by the algorithm
+    :param net_arch: hidden sizes of both kinds, or ``dict(pi=[…], qf=[…])``; Table 1: 64 (two layers, as MADDPG has)
+    :param activation_fn: activation between layers
+    :param n_critics: critics per agent
+    :param share_parameters: one actor and one critic per group instead of per agent
+    :param optimizer_class: optimiser of actors and of critics
+    :param optimizer_kwargs: its arguments, without the learning rate; Adam is fused by default (several times faster)
+    """
+
+    actor: StackedActors
+    actor_target: StackedActors
+    critic: StackedCritics
+    critic_target: StackedCritics
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        lr_schedule: Schedule,
+        layout: AgentLayout,
+        agents: Sequence[int],
+        critic_input_size: int,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        n_critics: int = 1,
+        share_parameters: bool = False,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        if optimizer_kwargs is None:
+            optimizer_kwargs = {"fused": True} if optimizer_class is th.optim.Adam else {}
+        super().__init__(
+            observation_space,
+            action_space,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            squash_output=not layout.discrete,
+        )
+        self.layout = layout
+        self._own_parameters = {
+            "layout": layout,
+            "agents": list(agents),
+            "critic_input_size": critic_input_size,
+            "net_arch": net_arch,
+            "activation_fn": activation_fn,
+            "n_critics": n_critics,
+            "share_parameters": share_parameters,
+            "optimizer_class": optimizer_class,
+            "optimizer_kwargs": optimizer_kwargs,
+        }
+        actor_arch, critic_arch = get_actor_critic_arch([64, 64] if net_arch is None else net_arch)
+
+        def make_actor() -> StackedActors:
+            return StackedActors(layout, agents, actor_arch, activation_fn, share_parameters)
+
+        def make_critic() -> StackedCritics:
+            return StackedCritics(layout, agents, critic_input_size, critic_arch, activation_fn, n_critics, share_parameters)
+
+        self.actor, self.actor_target = make_actor(), make_actor()
+        self.critic, self.critic_target = make_critic(), make_critic()
+        for network, target in ((self.actor, self.actor_target), (self.critic, self.critic_target)):
+            target.load_state_dict(network.state_dict())
+            target.requires_grad_(False)
+            network.optimizer = optimizer_class(network.parameters(), lr=lr_schedule(1), **optimizer_kwargs)  # type: ignore[call-arg]
+
+    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self._predict(observation, deterministic=deterministic)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        assert isinstance(observation, th.Tensor)
+        rows = self.joint_actions(self.actor, observation, explore=not deterministic)
+        return self.choices(rows) if self.layout.discrete else rows
+
+    def joint_actions(self, actors: StackedActors, observations: th.Tensor, explore: bool = False) -> th.Tensor:
+        """
+        The joint action as a critic sees it; zeros for agents that do not learn.
+
+        :param actors: the actors, or their targets
+        :param observations: joint rows (batch, joint)
+        :param explore: discrete agents draw from their softmax instead of taking its maximum
+        :return: (batch, joint action)
+        """
+        rows = observations.new_zeros(len(observations), sum(self.layout.action_sizes))
+        for block, actions in zip(actors.blocks, actors(observations, explore), strict=True):
+            block.action_columns.write(rows, actions)
+        return rows
+
+    def choices(self, rows: th.Tensor) -> th.Tensor:
+        """Joint one-hot rows → the chosen action of each agent, (batch, agents)."""
+        return th.stack([rows[:, columns].argmax(-1) for columns in self.layout.action_slices], dim=1)
+
+    def encode(self, actions: th.Tensor) -> th.Tensor:
+        """Stored joint actions → what a critic sees: one-hot for discrete agents, unchanged otherwise."""
+        if not self.layout.discrete:
+            return actions
+        choices = actions.long()
+        return th.cat([F.one_hot(choices[:, i], n) for i, n in enumerate(self.layout.action_sizes)], dim=1).float()
+
+    def to_env(self, rows: th.Tensor) -> np.ndarray:
+        """Joint actions as a critic sees them → actions of the env."""
+        if self.layout.discrete:
+            return self.choices(rows).cpu().numpy()
+        return self.unscale_action(rows.cpu().numpy())
+
+    def from_env(self, actions: np.ndarray) -> np.ndarray:
+        """Actions of the env → what the replay buffer stores: scaled to [-1, 1], or the choices as they are."""
+        return actions if self.layout.discrete else self.scale_action(actions)
+
+    def predict_agent(self, agent: str, observation: np.ndarray, deterministic: bool = True) -> np.ndarray:
+        """
+        Action of one agent from its own observation alone (decentralised execution).
+
+        :param agent: name of a learning agent
+        :param observation: its observation (obs,), or a batch (batch, obs)
+        :param deterministic: no exploration (discrete agents draw from their softmax otherwise)
+        :return: its action in its own action space, (action,) or (batch, action); choices for discrete agents
+        """
+        index = self.layout.agents.index(agent)
+        network = self.actor.network(index)
+        rows = th.as_tensor(np.atleast_2d(observation), dtype=th.float32, device=self.device)
+        with th.no_grad():
+            output = network(rows)
+        if self.layout.discrete:
+            actions = (output if deterministic else gumbel_perturbed(output)).argmax(-1).cpu().numpy()
+        else:
+            columns = self.layout.action_slices[index]
+            assert isinstance(self.action_space, spaces.Box)
+            low, high = self.action_space.low[columns], self.action_space.high[columns]
+            actions = low + 0.5 * (np.tanh(output.cpu().numpy()) + 1) * (high - low)
+        return actions if np.ndim(observation) > 1 else actions[0]
+
+    def set_training_mode(self, mode: bool) -> None:
+        self.actor.train(mode)
+        self.critic.train(mode)
+        self.training = mode
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        data.update(self._own_parameters, lr_schedule=self._dummy_schedule)
+        return data
+
+
+def gumbel_perturbed(logits: th.Tensor) -> th.Tensor:
+    """Logits plus Gumbel noise, whose argmax is a draw from their softmax."""
+    return logits - th.empty_like(logits).exponential_().log()
+
+
+MlpPolicy = MADDPGPolicy

@@ -1,0 +1,102 @@
+"""Rank-based prioritised replay (Schaul et al. 2015; eq. 3–4 of the paper)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+
+from sb3_kfcv.replay.joint_replay_buffer import JointReplayBuffer
+from sb3_kfcv.replay.ranks import importance_weights, rank_probabilities, stratified
+
+
+class PrioritizedReplayBuffer(JointReplayBuffer):
+    """
+    Replay by the rank of |δ|: ``P ∝ (1 / rank)^α``. Every transition keeps a positive probability; a new one ranks first
+    until it has been replayed.
+
+    :param alpha: degree of prioritisation (Schaul et al.: 0.7 for ranks)
+    :param beta_init: importance correction at the start (Schaul et al.: 0.5); grows linearly to 1 over training
+    :param sort_above: up to this many transitions ranks are exact at each draw; above, they are refreshed every
+        ``sort_every`` draws, since sorting would cost more than the update
+    :param sort_every: see ``sort_above``
+
+    The other parameters are those of :class:`JointReplayBuffer`.
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        n_agents: int = 1,
+        state_size: int = 0,
+        seed: int | None = None,
+        alpha: float = 0.7,
+        beta_init: float = 0.5,
+        sort_above: int = 20_000,
+        sort_every: int = 100,
+    ) -> None:
+        super().__init__(
+            buffer_size, observation_space, action_space, device, n_envs, optimize_memory_usage, n_agents, state_size, seed
+        )
+        if alpha < 0:
+            raise ValueError(f"alpha must be at least 0, got {alpha}")
+        if not 0 <= beta_init <= 1:
+            raise ValueError(f"beta_init must lie in [0, 1], got {beta_init}")
+        self.alpha, self.beta_init = alpha, beta_init
+        self.sort_above, self.sort_every = sort_above, sort_every
+        self.td_errors = np.full(self.buffer_size * n_envs, np.inf)  # |δ| of each row; infinite until replayed
+        self._by_rank = np.empty(0, dtype=np.int64)  # rows from the largest |δ| to the smallest
+        self._draws_since_sort = 0
+        self._probabilities = np.empty(0)
+        self._cumulative = np.empty(0)
+
+    @property
+    def beta(self) -> float:
+        """Importance correction now: from ``beta_init`` to 1 as training progresses."""
+        return self.beta_init + (1 - self.beta_init) * self.progress
+
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        first = self.pos * self.n_envs
+        self.td_errors[first : first + self.n_envs] = np.inf
+        super().add(*args, **kwargs)
+
+    def _draw(self, batch_size: int) -> tuple[np.ndarray, np.ndarray | None]:
+        n = self.n_rows
+        self._draws_since_sort += 1
+        if n <= self.sort_above or len(self._by_rank) == 0 or self._draws_since_sort >= self.sort_every:
+            self._by_rank = np.argsort(-self.td_errors[:n], kind="stable")
+            self._draws_since_sort = 0
+        n = len(self._by_rank)
+        if len(self._probabilities) != n:
+            self._probabilities = rank_probabilities(n, self.alpha)
+            self._cumulative = np.cumsum(self._probabilities)
+        ranks = stratified(self._cumulative, batch_size, self.rng)
+        weights = importance_weights(self._probabilities[ranks], n, self._probabilities[-1], self.beta)
+        return self._by_rank[ranks], weights
+
+    def update_priorities(self, rows: np.ndarray, td_errors: th.Tensor) -> None:
+        self.td_errors[rows] = td_errors.cpu().numpy()
+
+    def diagnostics(self) -> dict[str, Any]:
+        known = self.td_errors[: self.n_rows]
+        known = known[np.isfinite(known)]
+        stats: dict[str, Any] = {"per/beta": self.beta, "per/not_yet_replayed": 1 - len(known) / max(self.n_rows, 1)}
+        if len(known):
+            stats["per/td_error_median"] = float(np.median(known))
+            stats["per/td_errors"] = th.as_tensor(known)
+        return stats
+
+    def state_arrays(self) -> dict[str, np.ndarray]:
+        return {**super().state_arrays(), "td_errors": self.td_errors[: self.n_rows]}
+
+    def load_state_arrays(self, arrays: dict[str, np.ndarray]) -> None:
+        super().load_state_arrays(arrays)
+        self.td_errors[: self.n_rows] = arrays["td_errors"]
+        self._by_rank = np.empty(0, dtype=np.int64)
