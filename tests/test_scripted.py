@@ -311,5 +311,11 @@ class TestTeamPolicy:
         assert action.shape == (1, 3)
 
     def test_every_group_needs_a_player(self):
-        with pytest.raises(ValueError, match=r"players were given for \['wolf'\]; this world has \['sheep', 'wolf'\]"):
+        with pytest.raises(ValueError, match=r"players were given for \['wolf'\].*\['sheep', 'wolf'\]"):
             TeamPolicy(self.layout, {"wolf": "chase"})
+
+    def test_filling_in_one_group_keeps_the_actions_of_the_other(self):
+        team = TeamPolicy(self.layout, {"sheep": ConstantModel(-0.25, 6)}, groups=["sheep"])
+        actions = np.full((1, 6), 0.75, np.float32)
+        np.testing.assert_array_equal(team.fill(actions, self.rows), [[0.75] * 4 + [-0.25] * 2])
+        assert (actions == 0.75).all()

@@ -52,16 +52,20 @@ class StackedMLP(nn.Module):
     each network has an input of its own.
 
     Members may share a network: ``members[i]`` is the network that member i uses. Then every member has a
-    first-layer bias of its own, which is what appending its one-hot index to the input amounts to.
+    first-layer bias of its own, which is what appending its one-hot index to the input amounts to; and it may read a
+    common input in an order of its own: ``input_order[i][c]`` is the input of its network that takes column c.
 
     :param n_networks: number of networks
     :param sizes: width of the input, of each hidden layer, and of the output
     :param activation_fn: activation between layers
     :param n_inputs: number of distinct inputs; a divisor of ``n_networks``
     :param members: network of each member; by default member i uses network i
+    :param input_order: (members, in) order in which each member reads a common input; only with ``members`` and
+        ``n_inputs=1``
     """
 
     members: th.Tensor | None
+    input_order: th.Tensor | None
 
     def __init__(
         self,
@@ -70,6 +74,7 @@ class StackedMLP(nn.Module):
         activation_fn: type[nn.Module] = nn.ReLU,
         n_inputs: int | None = None,
         members: Sequence[int] | None = None,
+        input_order: th.Tensor | None = None,
     ) -> None:
         super().__init__()
         self.n_networks = n_networks
@@ -81,6 +86,7 @@ class StackedMLP(nn.Module):
         self.rest = nn.ModuleList(StackedLinear(n_networks, n_in, n_out) for n_in, n_out in pairwise(sizes[1:]))
         self.member_bias: nn.Parameter | None = None
         self.register_buffer("members", None if members is None else th.tensor(list(members)), persistent=False)
+        self.register_buffer("input_order", input_order, persistent=False)
         if members is not None:
             bound = 1 / math.sqrt(sizes[0] + len(members))
             self.member_bias = nn.Parameter(th.empty(len(members), 1, sizes[1]).uniform_(-bound, bound))
@@ -99,10 +105,15 @@ class StackedMLP(nn.Module):
         :param x: as for :meth:`forward`
         :return: (members, batch, hidden)
         """
+        width = self.sizes[1]
         if self.input_per_member:
             z = self.first(x, self.members)
+        elif self.input_order is not None:
+            weight = self._columns(self.first.weight, slice(None), self.input_order)  # (members, in, hidden)
+            weight = weight.transpose(0, 1).flatten(1)  # (in, members · hidden): still one product
+            z = (x[0] @ weight).unflatten(-1, (-1, width)).transpose(0, 1)
+            z = z + self.first.bias.unflatten(-1, (-1, width))[0, 0, self.members].unsqueeze(1)
         else:
-            width = self.sizes[1]
             z = self.first(x).unflatten(-1, (-1, width)).transpose(1, 2).flatten(0, 1)  # (networks, batch, hidden)
             z = z if self.members is None else z[self.members]
         return z if self.member_bias is None else z + self.member_bias
@@ -127,9 +138,14 @@ class StackedMLP(nn.Module):
         :param columns: (m, k) positions in the input
         :return: (m, k, hidden), without gradient
         """
-        weight = self.first.weight.detach()[0].unflatten(-1, (self.n_networks, self.sizes[1]))  # (in, networks, hidden)
-        networks = members if self.members is None else self.members[members]
-        return weight[columns, networks[:, None]]
+        if self.input_order is not None:
+            columns = self.input_order[members].gather(1, columns.to(self.input_order.device))
+        return self._columns(self.first.weight.detach(), members, columns)
+
+    def _columns(self, weight: th.Tensor, members: th.Tensor | slice, columns: th.Tensor) -> th.Tensor:
+        """Rows of the first layer's weight for some members, (members, columns, hidden)."""
+        everyone = th.arange(self.n_networks, device=weight.device) if self.members is None else self.members
+        return weight[0].unflatten(-1, (self.n_networks, self.sizes[1]))[columns, everyone[members][:, None]]
 
     def gradient_norms(self) -> th.Tensor:
         """Euclidean norm of each network's gradient: (networks,)."""
@@ -168,7 +184,10 @@ class StackedMLP(nn.Module):
         net = index if self.members is None else int(self.members[index])
         per_input = self.n_networks // self.n_inputs
         columns = slice(net % per_input * self.sizes[1], (net % per_input + 1) * self.sizes[1])
-        weights = [(self.first.weight[net // per_input][:, columns], self.first.bias[net // per_input, 0, columns].clone())]
+        first_weight = self.first.weight[net // per_input][:, columns]
+        if self.input_order is not None:
+            first_weight = first_weight[self.input_order[index]]
+        weights = [(first_weight, self.first.bias[net // per_input, 0, columns].clone())]
         if self.member_bias is not None:
             weights[0][1].add_(self.member_bias[index, 0])
         weights += [(layer.weight[net], layer.bias[net, 0]) for layer in self.rest]  # type: ignore[index]

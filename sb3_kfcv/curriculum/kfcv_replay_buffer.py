@@ -20,7 +20,7 @@ from sb3_kfcv.replay.joint_replay_buffer import JointReplayBuffer, Student
 
 SCORES = ("teachers", "student")
 
-# Rows that are read, targeted and scored at once during a refresh: bounds its memory.
+# Rows that pass through the networks at once during a refresh: bounds the memory of their activations.
 CHUNK = 1024
 
 UNSCORED = -1
@@ -30,8 +30,8 @@ class KFCVReplayBuffer(JointReplayBuffer):
     """
     K-Fold Cross Validation Curriculum Learning (KFCV-CL) over a replay buffer: section 4 and Algorithm 1 of Lin et al. 2022.
 
-    Every transition has a permanent fold. At each *refresh* K teacher critics are trained on their folds (eq. 9), every
-    transition is scored by the K − 1 teachers that have not seen it (eq. 10–11), and the transitions are ranked into K
+    Every transition has a permanent fold. At each *refresh* K teachers are trained on their folds (eq. 9), every transition
+    is scored by the K − 1 teachers that have not seen it (eq. 10–11), and the transitions are ranked into K
     buckets. The stages then draw from easy to hard (eq. 12), beside a share λ drawn uniformly from the whole buffer.
     Before the first refresh all draws are uniform; a transition that came after the last refresh is drawn by the uniform
     share alone; after the curriculum's share of training all draws are uniform and refreshes stop.
@@ -40,13 +40,14 @@ class KFCVReplayBuffer(JointReplayBuffer):
 
     :param n_folds: K: folds, teachers per agent, buckets and stages
     :param refresh_every: updates between refreshes (Algorithm 1 as printed refreshes at every step, at many times the cost)
-    :param refresh_fraction: refresh sooner when this share of the buffer is new, but not before a quarter of
-        ``refresh_every``, which bounds the cost where many worlds fill a small buffer
+    :param refresh_fraction: refresh sooner when this share of the transitions is new
+    :param scored_per_update: bound of the cost: refreshes are spaced so that at most this many transitions are scored
+        per update, whatever the size of the buffer and the number of worlds that fill it
     :param teacher_steps: gradient steps of the teachers per refresh
     :param first_teacher_steps: the same at the first refresh, from random networks
     :param teacher_batch_size: transitions per teacher and step
     :param teacher_learning_rate: of the teachers' Adam
-    :param teacher_net_arch: hidden sizes of the teachers; Table 1: 64, two layers as the student
+    :param teacher_net_arch: hidden sizes of the teachers; wider than the student's, since one network serves all agents
     :param stage_rule: ``"cumulative"``, ``"bucket"``, or the controls ``"anti"`` (hard to easy) and ``"random"``;
         see :func:`~sb3_kfcv.curriculum.stages.bucket_shares`
     :param lambda_init: Table 1's "initial curriculum factor λ": the uniform share at the start; 0 is section 4.2 to the letter
@@ -68,13 +69,14 @@ class KFCVReplayBuffer(JointReplayBuffer):
         state_size: int = 0,
         seed: int | None = None,
         n_folds: int = 5,
-        refresh_every: int = 1000,
+        refresh_every: int = 250,
         refresh_fraction: float = 0.25,
-        teacher_steps: int = 50,
+        scored_per_update: int = 50,
+        teacher_steps: int = 25,
         first_teacher_steps: int = 500,
         teacher_batch_size: int = 128,
         teacher_learning_rate: float = 1e-3,
-        teacher_net_arch: Sequence[int] = (64, 64),
+        teacher_net_arch: Sequence[int] = (128, 128),
         stage_rule: str = "cumulative",
         lambda_init: float = 0.1,
         curriculum_fraction: float = 0.5,
@@ -94,7 +96,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
             if not 0 <= value <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], got {value}")
         self.n_folds = n_folds
-        self.refresh_every, self.refresh_fraction = refresh_every, refresh_fraction
+        self.refresh_every, self.refresh_fraction, self.scored_per_update = refresh_every, refresh_fraction, scored_per_update
         self.teacher_steps, self.first_teacher_steps = teacher_steps, first_teacher_steps
         self.teacher_batch_size = teacher_batch_size
         self.teacher_learning_rate, self.teacher_net_arch = teacher_learning_rate, tuple(teacher_net_arch)
@@ -180,44 +182,25 @@ class KFCVReplayBuffer(JointReplayBuffer):
         return self._rows_of_bucket
 
     def _refresh_is_due(self) -> bool:
-        if self.n_rows < max(self.n_folds, self.teacher_batch_size):
-            return False
-        many_new = self._new_since_refresh >= self.refresh_fraction * self.buffer_size * self.n_envs
-        return (
-            self.n_refreshes == 0
-            or self._updates_since_refresh >= self.refresh_every
-            or (many_new and self._updates_since_refresh >= self.refresh_every / 4)
-        )
+        n, waited = self.n_rows, self._updates_since_refresh
+        if self.n_refreshes == 0:
+            return n >= max(self.n_folds, self.teacher_batch_size)
+        many_new = self._new_since_refresh >= self.refresh_fraction * n
+        return waited * self.scored_per_update >= n and (many_new or waited >= self.refresh_every)
 
     def refresh(self) -> None:
         """Train the teachers, score every transition, rank them into buckets: the assessment of section 4.1."""
         start = time.perf_counter()
         n = self.n_rows
-        rows = np.arange(n)
-        targets, live, student_errors = self._targets(rows)
-        folds = self.folds[:n]
-
+        inputs, targets, live = self._read_all()
+        student_errors = (targets - self._student_values(inputs)).square()
         if self.score == "student":
             scores = combine_agents(student_errors, live)
         else:
-            # Targets in units of their own spread: eq. 9 has the same minimum, and few steps come near it.
-            scale = targets.std(1, keepdim=True).clamp(min=1e-6)
-            targets = (targets - targets.mean(1, keepdim=True)) / scale
-            in_fold_loss = self._train_teachers(folds, targets, live)
-            errors, values_spread = self._teacher_errors(rows, targets)
-            scores = combine_agents(errors, live)
-            held_out = (errors * live).sum() / live.sum().clamp(min=1) / (self.n_folds - 1)
-            self._stats["curriculum/teacher_loss_in_fold"] = in_fold_loss
-            self._stats["curriculum/teacher_loss_held_out"] = held_out.item()
-            self._stats["curriculum/teacher_disagreement"] = values_spread
+            scores = self._teacher_scores(inputs, targets, live)
+        self._note_correlations(scores, combine_agents(student_errors, live))
         if self.stage_rule == "random":
             scores = self.rng.random(n)
-
-        known = self.buckets[:n] != UNSCORED
-        if known.sum() > 1:
-            self._stats["curriculum/rank_correlation_with_last"] = rank_correlation(self.scores[:n][known], scores[known])
-        student_scores = combine_agents(student_errors, live)
-        self._stats["curriculum/rank_correlation_with_student"] = rank_correlation(scores, student_scores)
         self.scores[:n] = scores
         self.buckets[:n] = buckets_by_difficulty(scores, self.n_folds)
         self._rows_of_bucket = None
@@ -225,35 +208,40 @@ class KFCVReplayBuffer(JointReplayBuffer):
         self.n_refreshes += 1
         self._refresh_seconds += time.perf_counter() - start
 
-    def _targets(self, rows: np.ndarray) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """y, liveness, and the student's squared TD errors of all rows, each (agents, n)."""
-        parts = []
-        for chunk in np.array_split(rows, -(-len(rows) // CHUNK)):
-            batch = self.rows(chunk)
-            target = self.student.td_target(batch)
-            error = (target - self.student.q_values(self.student.critic_inputs(batch))).square()
-            parts.append((target, self.student.live(batch), error))
-        targets, live, errors = (th.cat(part, dim=1) for part in zip(*parts, strict=True))
-        return targets, live, errors
+    def _read_all(self) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Critic inputs (n, features), TD targets (agents, n), and 1 where the agent lived (agents, n), of all rows."""
+        n, student = self.n_rows, self.student
+        batches = (self.rows(np.arange(first, min(first + CHUNK, n))) for first in range(0, n, CHUNK))
+        parts = [(student.critic_inputs(batch), student.td_target(batch), student.live(batch)) for batch in batches]
+        inputs, targets, live = zip(*parts, strict=True)
+        return th.cat(inputs), th.cat(targets, dim=1), th.cat(live, dim=1)
 
-    def _train_teachers(self, folds: np.ndarray, targets: th.Tensor, live: th.Tensor) -> float:
-        def read(rows: np.ndarray) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-            picked = th.as_tensor(rows, device=self.device)
-            return self.student.critic_inputs(self.rows(rows)), targets[:, picked], live[:, picked]
+    def _student_values(self, inputs: th.Tensor) -> th.Tensor:
+        return th.cat([self.student.q_values(part) for part in inputs.split(CHUNK)], dim=1)
 
+    def _teacher_scores(self, inputs: th.Tensor, targets: th.Tensor, live: th.Tensor) -> np.ndarray:
+        """Train the teachers on their folds, and score every row by those that have not seen it (eq. 9–11): (n,)."""
+        # Targets in units of their own spread: eq. 9 has the same minimum, and few steps come near it.
+        targets = (targets - targets.mean(1, keepdim=True)) / targets.std(1, keepdim=True).clamp(min=1e-6)
+        folds = self.folds[: self.n_rows]
         steps = self.teacher_steps if self.n_refreshes else self.first_teacher_steps
-        return self.teachers.fit(rows_per_fold(folds, self.n_folds), read, steps, self.teacher_batch_size, self.rng)
+        members = rows_per_fold(folds, self.n_folds)
+        in_fold_loss = self.teachers.fit(inputs, targets, live, members, steps, self.teacher_batch_size, self.rng)
+        with th.no_grad():
+            values = th.cat([self.teachers.values(part.unsqueeze(0)) for part in inputs.split(CHUNK)], dim=2)
+            errors = cross_validated_errors(targets, values, th.as_tensor(folds, device=self.device))
+        held_out_loss = (errors * live).sum() / live.sum().clamp(min=1) / (self.n_folds - 1)
+        self._stats["curriculum/teacher_loss_in_fold"] = in_fold_loss
+        self._stats["curriculum/teacher_loss_held_out"] = held_out_loss.item()
+        return combine_agents(errors, live)
 
-    @th.no_grad()
-    def _teacher_errors(self, rows: np.ndarray, targets: th.Tensor) -> tuple[th.Tensor, float]:
-        """Summed squared errors of the teachers that have not seen each row (agents, n), and how far they disagree."""
-        errors, spreads = [], []
-        for chunk in np.array_split(rows, -(-len(rows) // CHUNK)):
-            values = self.teachers.values(self.student.critic_inputs(self.rows(chunk)).unsqueeze(0))
-            folds = th.as_tensor(self.folds[chunk], device=self.device)
-            errors.append(cross_validated_errors(targets[:, chunk[0] : chunk[-1] + 1], values, folds))
-            spreads.append(values.std(0).mean())
-        return th.cat(errors, dim=1), th.stack(spreads).mean().item()
+    def _note_correlations(self, scores: np.ndarray, student_scores: np.ndarray) -> None:
+        """How the ranking agrees with that of the last refresh, and with the student's own squared TD error."""
+        known = self.buckets[: len(scores)] != UNSCORED
+        if known.sum() > 1:
+            last = self.scores[: len(scores)][known]
+            self._stats["curriculum/rank_correlation_with_last"] = rank_correlation(last, scores[known])
+        self._stats["curriculum/rank_correlation_with_student"] = rank_correlation(scores, student_scores)
 
     def diagnostics(self) -> dict[str, Any]:
         """Stage, λ, shares, score quantiles per bucket, the teachers' losses, rank correlations, and the scores themselves."""

@@ -1,8 +1,8 @@
-"""The teachers: K critics per learning agent, each trained on its own fold alone (eq. 9)."""
+"""The teachers: K critics, each trained on its own fold alone (eq. 9)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch as th
@@ -12,11 +12,14 @@ from sb3_kfcv.common.stacked_networks import StackedMLP
 
 class Teachers:
     """
-    All K·N teacher critics as one stack. They start from their own random initialisation and live as long as the
-    buffer; never from the student, which has seen every fold.
+    K teacher networks as one stack. A teacher gives the Q-value of every learning agent, one output each: it learns
+    several times faster than one network per agent at the same cost, and the cost hardly grows with the agents.
+
+    They start from their own random initialisation and live as long as the buffer; never from the student, which has
+    seen every fold.
 
     :param n_folds: K
-    :param n_agents: N, the learning agents
+    :param n_agents: the learning agents
     :param input_size: length of a critic's input
     :param net_arch: hidden sizes
     :param learning_rate: of Adam
@@ -32,8 +35,8 @@ class Teachers:
         learning_rate: float,
         device: th.device | str,
     ) -> None:
-        self.n_folds, self.n_agents = n_folds, n_agents
-        self.stack = StackedMLP(n_folds * n_agents, [input_size, *net_arch, 1], n_inputs=n_folds).to(device)
+        self.n_folds = n_folds
+        self.stack = StackedMLP(n_folds, [input_size, *net_arch, n_agents]).to(device)
         self.optimizer = th.optim.Adam(self.stack.parameters(), lr=learning_rate, fused=True)
 
     def values(self, inputs: th.Tensor) -> th.Tensor:
@@ -41,13 +44,14 @@ class Teachers:
         :param inputs: (folds, batch, features), one batch per teacher; or (1, batch, features), the same for all
         :return: Q (folds, agents, batch)
         """
-        q_values = self.stack(inputs.expand(self.n_folds, -1, -1)).squeeze(-1)
-        return q_values.unflatten(0, (self.n_folds, self.n_agents))
+        return self.stack(inputs.expand(self.n_folds, -1, -1)).transpose(1, 2)
 
     def fit(
         self,
+        inputs: th.Tensor,
+        targets: th.Tensor,
+        live: th.Tensor,
         rows_per_fold: list[np.ndarray],
-        read: Callable[[np.ndarray], tuple[th.Tensor, th.Tensor, th.Tensor]],
         steps: int,
         batch_size: int,
         rng: np.random.Generator,
@@ -55,8 +59,10 @@ class Teachers:
         """
         Regress every teacher on the TD targets of its own fold (eq. 9).
 
-        :param rows_per_fold: the rows of each fold; none empty
-        :param read: rows → inputs (batch, features), targets (agents, batch), and 1 where the agent lived (agents, batch)
+        :param inputs: critic inputs of all transitions, (n, features)
+        :param targets: y, (agents, n)
+        :param live: 1 where the agent lived, (agents, n)
+        :param rows_per_fold: which transitions are each fold's; none empty
         :param steps: gradient steps
         :param batch_size: transitions per teacher and step
         :param rng: generator of the draws
@@ -64,12 +70,11 @@ class Teachers:
         """
         losses = []
         for _ in range(steps):
-            drawn = np.concatenate([rows[rng.integers(len(rows), size=batch_size)] for rows in rows_per_fold])
-            inputs, targets, live = read(drawn)  # (folds · batch, …), fold after fold
-            values = self.values(inputs.unflatten(0, (self.n_folds, batch_size)))  # (folds, agents, batch)
-            errors = (targets.unflatten(1, (self.n_folds, batch_size)).transpose(0, 1) - values).square()
-            live = live.unflatten(1, (self.n_folds, batch_size)).transpose(0, 1)
-            per_teacher = (errors * live).sum(-1) / live.sum(-1).clamp(min=1)  # (folds, agents)
+            drawn = np.stack([rows[rng.integers(len(rows), size=batch_size)] for rows in rows_per_fold])  # (folds, batch)
+            picked = th.as_tensor(drawn, device=inputs.device)
+            errors = (targets[:, picked].transpose(0, 1) - self.values(inputs[picked])).square()  # (folds, agents, batch)
+            lived = live[:, picked].transpose(0, 1)
+            per_teacher = (errors * lived).sum(-1) / lived.sum(-1).clamp(min=1)  # (folds, agents)
             self.optimizer.zero_grad()
             per_teacher.sum().backward()
             self.optimizer.step()

@@ -47,7 +47,7 @@ class HardSpreadArrays(NamedTuple):
     """What HardSpread adds to :class:`WorldArrays`; E worlds, n landmarks, W walls."""
 
     landmarks: np.ndarray  # (E, n, 2)
-    walls: np.ndarray  # (E, W, 2): x of the middle line and y of the door's centre
+    inner_walls: np.ndarray  # (E, W, 2): x of the middle line and y of the door's centre
     walls_drawn: np.ndarray  # (E,) bool: whether the walls stay at the next reset
     totals: np.ndarray  # (E, N_TOTALS)
 
@@ -117,20 +117,21 @@ class HardSpreadWorlds(ParticleWorlds):
             max_steps=max_steps,
             continuous_actions=continuous_actions,
         )
-        self.walls = walls
+        self.walls = walls if isinstance(walls, str) else listed
         self.wall_width = float(wall_width)
         self.door = float(door)
         self.phi = float(phi)
         self.exclusive_cover = bool(exclusive_cover)
         self._arrays_of_hard_spread = HardSpreadArrays(
             landmarks=np.zeros((n_worlds, n_agents, 2)),
-            walls=np.zeros((n_worlds, n_walls, 2)),
+            inner_walls=np.zeros((n_worlds, n_walls, 2)),
             walls_drawn=np.full(n_worlds, listed is not None, dtype=np.bool_),
             totals=np.zeros((n_worlds, N_TOTALS)),
         )
         if listed:
-            self._own.walls[:] = listed
+            self._own.inner_walls[:] = listed
         self.landmarks = self._own.landmarks
+        self.inner_walls = self._own.inner_walls
 
     @property
     def _own(self) -> HardSpreadArrays:
@@ -157,7 +158,7 @@ class HardSpreadWorlds(ParticleWorlds):
         )
 
     def states(self) -> np.ndarray:
-        parts = (self.positions, self.velocities, self._own.landmarks, self._own.walls)
+        parts = (self.positions, self.velocities, self._own.landmarks, self._own.inner_walls)
         return np.concatenate([part.reshape(self.n_worlds, -1) for part in parts], axis=1, dtype=np.float32)
 
     def episode_metrics(self) -> np.ndarray:
@@ -183,12 +184,10 @@ class HardSpreadWorlds(ParticleWorlds):
 
     def scene(self, world: int) -> Scene:
         landmarks = [Disc(x, y, LANDMARK_RADIUS, PALETTE["landmark"]) for x, y in self._own.landmarks[world]]
-        agents = [
-            Disc(x, y, AGENT_RADIUS, PALETTE["agent"], label=str(i)) for i, (x, y) in enumerate(self.positions[world])
-        ]
+        agents = [Disc(x, y, AGENT_RADIUS, PALETTE["agent"], label=str(i)) for i, (x, y) in enumerate(self.positions[world])]
         half = self.wall_width / 2
         pieces = []
-        for x, door_y in self._own.walls[world]:
+        for x, door_y in self._own.inner_walls[world]:
             pieces.append(Rectangle(x - half, -HALF_SIZE, x + half, door_y - self.door / 2, PALETTE["wall"]))
             pieces.append(Rectangle(x - half, door_y + self.door / 2, x + half, HALF_SIZE, PALETTE["wall"]))
         covered = int(self._own.totals[world, COVERED_LAST])
@@ -198,7 +197,7 @@ class HardSpreadWorlds(ParticleWorlds):
 
 def _listed_walls(
     walls: str | Sequence[tuple[float, float]], wall_width: float, door: float
-) -> Sequence[tuple[float, float]] | None:
+) -> list[tuple[float, float]] | None:
     """
     Check the settings of the walls.
 
@@ -216,26 +215,30 @@ def _listed_walls(
         widest = (2 * HALF_SIZE - (N_RANDOM_WALLS + 1) * MIN_ROOM_WIDTH) / N_RANDOM_WALLS
         if walls != "none" and wall_width > widest:
             raise ValueError(f"wall_width is {wall_width}; two walls leave three rooms of {MIN_ROOM_WIDTH} up to {widest}")
-        return () if walls == "none" else None
-    _check_listed_walls(walls, wall_width, door)
-    return walls
+        return [] if walls == "none" else None
+    try:
+        listed = [(float(x), float(door_y)) for x, door_y in walls]
+    except (TypeError, ValueError):
+        raise ValueError(f"walls is {walls}; it must be a list of (x, y of the door's centre)") from None
+    _check_rooms(listed, wall_width, door)
+    return listed
 
 
-def _check_listed_walls(walls: Sequence[tuple[float, float]], wall_width: float, door: float) -> None:
+def _check_rooms(walls: list[tuple[float, float]], wall_width: float, door: float) -> None:
     """
+    :param walls: (x, y of the door's centre) of each
     :raises ValueError: if a room is narrower than an agent, or a door reaches beyond the plane
     """
-    if np.shape(walls)[1:] != (2,) and len(walls) > 0:
-        raise ValueError(f"walls is {walls}; it must be a list of (x, y of the door's centre)")
+    least = 2 * AGENT_RADIUS
     face = -HALF_SIZE
     for x, door_y in sorted(walls):
-        if not x - wall_width / 2 >= face + 2 * AGENT_RADIUS:
-            raise ValueError(f"the wall at x = {x} leaves no room to its left; an agent needs {2 * AGENT_RADIUS}")
+        if not x - wall_width / 2 >= face + least:
+            raise ValueError(f"the wall at x = {x} leaves no room to its left; an agent needs {least}")
+        if not x + wall_width / 2 <= HALF_SIZE - least:
+            raise ValueError(f"the wall at x = {x} leaves no room to its right; an agent needs {least}")
         if not abs(door_y) <= HALF_SIZE - door / 2:
-            raise ValueError(f"the door at y = {door_y} reaches beyond the plane; at most {HALF_SIZE - door / 2} is possible")
+            raise ValueError(f"the door at y = {door_y} reaches beyond the plane; possible is ±{HALF_SIZE - door / 2}")
         face = x + wall_width / 2
-    if len(walls) > 0 and not face <= HALF_SIZE - 2 * AGENT_RADIUS:
-        raise ValueError(f"the wall at x = {max(walls)[0]} leaves no room to its right; an agent needs {2 * AGENT_RADIUS}")
 
 
 @njit(cache=True, nogil=True)
@@ -252,14 +255,14 @@ def _reset(worlds, common, own, wall_width, door, keep_walls):
     """
     for world in worlds:
         if not own.walls_drawn[world]:
-            _draw_walls(common.rng, world, own.walls[world], wall_width, door)
+            _draw_walls(common.rng, world, own.inner_walls[world], wall_width, door)
             own.walls_drawn[world] = keep_walls
         for i in range(common.positions.shape[1]):
             _draw_free_position(
-                common.rng, world, common.positions[world, i], AGENT_RADIUS, own.walls[world], wall_width, door
+                common.rng, world, common.positions[world, i], AGENT_RADIUS, own.inner_walls[world], wall_width, door
             )
             _draw_free_position(
-                common.rng, world, own.landmarks[world, i], LANDMARK_RADIUS, own.walls[world], wall_width, door
+                common.rng, world, own.landmarks[world, i], LANDMARK_RADIUS, own.inner_walls[world], wall_width, door
             )
         common.velocities[world] = 0.0
         common.terminated[world] = False
@@ -315,7 +318,7 @@ def _distance_to_wall(position, wall, wall_width, door):
 
 
 @njit(cache=True)
-def _touches_wall(position, walls, wall_width, door):
+def touches_wall(position, walls, wall_width, door):
     """Whether an agent's centre is closer than its radius to the face of an inner or outer wall."""
     if max(abs(position[0]), abs(position[1])) > HALF_SIZE - AGENT_RADIUS:
         return True
@@ -346,7 +349,7 @@ def _step(actions, common, own, wall_width, door, phi, exclusive_cover, max_step
         positions = common.positions[world]
         velocities = common.velocities[world]
         landmarks = own.landmarks[world]
-        walls = own.walls[world]
+        walls = own.inner_walls[world]
         totals = own.totals[world]
         alive = common.alive[world]
 
@@ -413,7 +416,7 @@ def _find_contacts(collided, positions, walls, wall_width, door, totals):
     """
     n = positions.shape[0]
     for i in range(n):
-        collided[i] = _touches_wall(positions[i], walls, wall_width, door)
+        collided[i] = touches_wall(positions[i], walls, wall_width, door)
         totals[AGENTS_AT_WALLS] += collided[i]
     for i in range(n):
         for j in range(i + 1, n):

@@ -34,7 +34,7 @@ class ParticleParallelEnv(ParallelEnv):
             raise ValueError(f"unknown render_mode {render_mode!r}; possible are None, {', '.join(map(repr, RENDER_MODES))}")
         self.worlds = worlds
         self.render_mode = render_mode
-        self.metadata = {
+        self.metadata: dict[str, Any] = {
             "name": name,
             "render_modes": list(RENDER_MODES),
             "render_fps": worlds.render_fps,
@@ -76,9 +76,7 @@ class ParticleParallelEnv(ParallelEnv):
 
     def step(
         self, actions: dict[str, Any]
-    ) -> tuple[
-        dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
-    ]:
+    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """
         Move all living agents.
 

@@ -60,8 +60,8 @@ class MADDPG(OffPolicyAlgorithm):
     :param optimize_memory_usage: not supported
     :param critic_input: ``"observations"`` (all agents', as in the paper) or ``"state"`` (the world's ``state()``, which
         makes the critics' first layer many times smaller where the world is fully observable)
-    :param share_parameters: one actor and one critic per group of agents instead of per agent; members of a group are
-        told apart by a learnt bias, which is what a one-hot index in the input amounts to
+    :param share_parameters: one actor and one critic per group of agents instead of per agent. The critic reads the joint
+        input with the agent itself first; both tell the agents apart by a learnt bias, as by a one-hot index in the input
     :param team: learn only the agents of this group; the others act by ``opponents``
     :param opponents: with ``team``: for each other group the name of a scripted policy, or anything with ``predict`` on
         joint rows, such as a trained model

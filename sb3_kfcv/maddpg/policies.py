@@ -166,9 +166,11 @@ class StackedCritics(nn.Module):
         self.positions = [th.tensor([list(agents).index(i) for i in block.agents]) for block in self.blocks]
         members = shared_members(layout, agents) if share_parameters else None
         n_networks = max(members) + 1 if members else len(agents)
+        order = ego_order(layout, agents, input_size) if share_parameters else None
         sizes = [input_size, *net_arch, 1]
         self.stacks = nn.ModuleList(
-            StackedMLP(n_networks, sizes, activation_fn, n_inputs=1, members=members) for _ in range(n_critics)
+            StackedMLP(n_networks, sizes, activation_fn, n_inputs=1, members=members, input_order=order)
+            for _ in range(n_critics)
         )
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
@@ -210,6 +212,35 @@ def shared_members(layout: AgentLayout, agents: Sequence[int]) -> list[int]:
     """Which network each agent uses when one network serves a group: 0 for the first group met, 1 for the next, …"""
     groups = list(dict.fromkeys(layout.groups[i] for i in agents))
     return [groups.index(layout.groups[i]) for i in agents]
+
+
+def ego_order(layout: AgentLayout, agents: Sequence[int], input_size: int) -> th.Tensor:
+    """
+    The order in which each agent's critic reads the joint input when a group shares one critic: the agent itself first,
+    then the others of its group in turn; other groups, and a world state, as they are.
+
+    :param layout: who sits where in the joint rows
+    :param agents: the learning agents
+    :param input_size: length of the critics' input: all observations, or the world's state, and then the joint action
+    :return: (agents, input) which input of the shared network takes each column
+    :raises ValueError: if agents of a group have different spaces
+    """
+    n_seen = input_size - sum(layout.action_sizes)
+    parts = [(n_seen, layout.action_slices)]
+    if n_seen == sum(layout.obs_sizes) != layout.state_size:
+        parts.append((0, layout.obs_slices))
+    order = th.arange(input_size).repeat(len(agents), 1)
+    for row, agent in enumerate(agents):
+        members = layout.members(layout.groups[agent])
+        shapes = {(layout.obs_sizes[i], layout.action_sizes[i]) for i in members}
+        if len(shapes) > 1:
+            raise ValueError(f"share_parameters needs equal spaces within a group; {layout.groups[agent]!r} has {shapes}")
+        turn = members.index(agent)
+        for start, columns in parts:
+            for place, other in enumerate(members):
+                read, taken = columns[other], columns[members[place - turn]]
+                order[row, start + read.start : start + read.stop] = th.arange(start + taken.start, start + taken.stop)
+    return order
 
 
 class MADDPGPolicy(BasePolicy):

@@ -46,7 +46,7 @@ class ParticleVecEnv(VecEnv):
             raise ValueError(f"unknown render_mode {render_mode!r}; a batch of worlds has 'rgb_array' and None")
         self.worlds = worlds
         self.render_mode = render_mode
-        observation_spaces = {agent: worlds.observation_space(agent) for agent in worlds.agents}
+        observation_spaces: dict[str, spaces.Space] = {agent: worlds.observation_space(agent) for agent in worlds.agents}
         action_spaces = {agent: worlds.action_space(agent) for agent in worlds.agents}
         self.layout = AgentLayout.from_spaces(worlds.agents, observation_spaces, action_spaces, worlds.state_size)
         self.metric_names = (*worlds.metric_names, *(f"return_{group}" for group in self.layout.group_names))
@@ -56,11 +56,11 @@ class ParticleVecEnv(VecEnv):
         super().__init__(
             worlds.n_worlds,
             joint_box(list(observation_spaces.values())),
-            spaces.MultiDiscrete(self.layout.action_sizes)
+            spaces.MultiDiscrete(list(self.layout.action_sizes))
             if self.layout.discrete
             else joint_box(list(action_spaces.values())),
         )
-        self.metadata["render_fps"] = worlds.render_fps
+        self.metadata = {**self.metadata, "render_fps": worlds.render_fps}  # type: ignore[dict-item]
 
     def reset(self) -> np.ndarray:
         """
@@ -113,7 +113,9 @@ class ParticleVecEnv(VecEnv):
         """Joint actions, (worlds, action), as the worlds take them: per agent."""
         shape = (self.num_envs, *(self.action_space.shape or ()))
         if np.shape(actions) != shape:
-            raise ValueError(f"actions have shape {np.shape(actions)}; {self.num_envs} worlds take joint rows of shape {shape}")
+            raise ValueError(
+                f"actions have shape {np.shape(actions)}; {self.num_envs} worlds take joint rows of shape {shape}"
+            )
         return actions if self.layout.discrete else np.reshape(actions, (self.num_envs, self.layout.n_agents, 2))
 
     def _describe_ends(self, infos: list[dict[str, Any]], observations: np.ndarray, ended: np.ndarray) -> None:
@@ -155,7 +157,7 @@ class ParticleVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of single worlds: ``state``, ``get_state``, ``set_state``, ``episode_metrics``, ``render``, ``scene``."""
+        """Call ``state``, ``get_state``, ``set_state``, ``episode_metrics``, ``render`` or ``scene`` of single worlds."""
         return [getattr(self._views[i], method_name)(*method_args, **method_kwargs) for i in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:

@@ -1,0 +1,216 @@
+"""What happens beside the training: evaluation, checkpoints, and stopping when told to."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, EventCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
+
+from sb3_kfcv.common.evaluation import evaluate, with_interval
+from sb3_kfcv.common.files import atomic_write
+from sb3_kfcv.common.normalization import save_model
+
+
+class MultiAgentEvalCallback(EventCallback):
+    """
+    SB3's ``EvalCallback`` with every metric of the worlds: logs ``eval/mean_reward``, ``eval/mean_ep_length`` and
+    ``eval/<metric>``, keeps the best model, and writes all episodes of all evaluations to ``evaluations.npz``.
+
+    That file has SB3's arrays ``timesteps`` (evaluations,), ``results`` and ``ep_lengths`` (evaluations, episodes), and
+    one more of this shape for each metric.
+
+    :param eval_env: the worlds, with seeds of their own
+    :param eval_freq: env steps between evaluations
+    :param n_eval_episodes: episodes per evaluation
+    :param log_path: folder of ``evaluations.npz``; ``None`` writes none
+    :param best_model_save_path: folder of ``best_model.zip``, the model with the highest mean reward; ``None`` keeps none
+    :param deterministic: evaluate without exploration
+    :param eval_at_start: evaluate also before the first step
+    :param callback_after_eval: called after each evaluation
+    :param verbose: 1 prints the results
+    """
+
+    def __init__(
+        self,
+        eval_env: VecEnv,
+        eval_freq: int = 25_000,
+        n_eval_episodes: int = 20,
+        log_path: str | Path | None = None,
+        best_model_save_path: str | Path | None = None,
+        deterministic: bool = True,
+        eval_at_start: bool = False,
+        callback_after_eval: BaseCallback | None = None,
+        verbose: int = 1,
+    ) -> None:
+        super().__init__(callback_after_eval, verbose)
+        self.eval_env = eval_env
+        self.eval_freq = eval_freq
+        self.n_eval_episodes = n_eval_episodes
+        self.log_path = Path(log_path) if log_path else None
+        self.best_model_save_path = Path(best_model_save_path) if best_model_save_path else None
+        self.deterministic = deterministic
+        self.eval_at_start = eval_at_start
+        self.best_mean_reward = -np.inf
+        self.last_mean_reward = -np.inf
+        self.timesteps: list[int] = []
+        self.evaluations: list[dict[str, np.ndarray]] = []
+
+    def _on_training_start(self) -> None:
+        self._next = _next_multiple(self.eval_freq, self.num_timesteps)
+        if self.eval_at_start:
+            self.evaluate()
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps < self._next:
+            return True
+        self._next = _next_multiple(self.eval_freq, self.num_timesteps)
+        self.evaluate()
+        return self._on_event() if self.callback is not None else True
+
+    def evaluate(self) -> None:
+        """Evaluate the model as it is now: log, write, and keep it if it is the best."""
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self.eval_env)
+        episodes = evaluate(self.model, self.eval_env, self.n_eval_episodes, self.deterministic)
+        self.timesteps.append(self.num_timesteps)
+        self.evaluations.append(episodes)
+        self._write()
+        self._log(episodes)
+        self.last_mean_reward = float(episodes["reward"].mean())
+        if self.last_mean_reward > self.best_mean_reward:
+            self.best_mean_reward = self.last_mean_reward
+            if self.best_model_save_path is not None:
+                save_model(self.model, self.best_model_save_path / "best_model.zip")
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All evaluations so far, as in ``evaluations.npz``."""
+        names = {"reward": "results", "length": "ep_lengths"}
+        stacked = {
+            names.get(name, name): np.stack([episodes[name] for episodes in self.evaluations]) for name in self.evaluations[0]
+        }
+        return {"timesteps": np.array(self.timesteps), **stacked}
+
+    def _write(self) -> None:
+        if self.log_path is not None:
+            with atomic_write(self.log_path / "evaluations.npz") as file:
+                np.savez(file, **self.arrays())  # type: ignore[arg-type]
+
+    def _log(self, episodes: dict[str, np.ndarray]) -> None:
+        names = {"reward": "mean_reward", "length": "mean_ep_length"}
+        for name, values in episodes.items():
+            self.logger.record(f"eval/{names.get(name, name)}", float(values.mean()))
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+        if self.verbose:
+            returns = {name.removeprefix("return_"): v for name, v in episodes.items() if name.startswith("return_")}
+            parts = ", ".join(f"{group} {with_interval(values)}" for group, values in returns.items())
+            reward = with_interval(episodes["reward"])
+            print(f"evaluation at {self.num_timesteps:,} env steps: reward {reward} (returns: {parts})")
+
+
+class PeriodicCheckpoint(BaseCallback):
+    """
+    Saves ``rl_model_<N>_steps.zip`` every so many env steps, between a training and the next rollout, where model and
+    replay buffer belong together.
+
+    :param save_freq: env steps between checkpoints
+    :param save_path: folder
+    :param save_replay_buffer: save ``rl_model_replay_buffer_<N>_steps.npz``, too
+    """
+
+    model: OffPolicyAlgorithm
+
+    def __init__(self, save_freq: int, save_path: str | Path, save_replay_buffer: bool = False) -> None:
+        super().__init__()
+        self.save_freq = save_freq
+        self.save_path = Path(save_path)
+        self.save_replay_buffer = save_replay_buffer
+
+    def _on_training_start(self) -> None:
+        self._next = _next_multiple(self.save_freq, self.num_timesteps)
+
+    def _on_rollout_start(self) -> None:
+        self._save_if_due()
+
+    def _on_training_end(self) -> None:
+        self._save_if_due()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _save_if_due(self) -> None:
+        steps = self.model.num_timesteps
+        if steps < self._next:
+            return
+        self._next = _next_multiple(self.save_freq, steps)
+        save_model(self.model, self.save_path / f"rl_model_{steps}_steps.zip")
+        if self.save_replay_buffer:
+            self.model.save_replay_buffer(self.save_path / f"rl_model_replay_buffer_{steps}_steps.npz")
+
+
+class StopOnSignal(BaseCallback):
+    """
+    Ends the training at the next step when the process is told to (Ctrl-C, SIGTERM), so that the model can be saved.
+    A second signal interrupts at once. Signals are caught between ``with`` and its end.
+    """
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.received: int | None = None
+
+    def __enter__(self) -> StopOnSignal:
+        self._before = {number: signal.signal(number, self._receive) for number in self.SIGNALS}
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _receive(self, number: int, _: FrameType | None) -> None:
+        if self.received is not None:
+            raise KeyboardInterrupt
+        self.received = number
+
+    def _on_step(self) -> bool:
+        return self.received is None
+
+
+class TrainByTheClock(BaseCallback):
+    """
+    Ends the training after some time. Its progress, which schedules and the curriculum follow, is the share of the time
+    that has passed, so ``total_timesteps`` only has to be larger than what the time allows.
+
+    :param seconds: wall-clock time of the training, evaluations included
+    """
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__()
+        self.seconds = seconds
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the training started."""
+        return time.monotonic() - self._start
+
+    def _on_training_start(self) -> None:
+        self._start = time.monotonic()
+
+    def _on_step(self) -> bool:
+        # SB3 computes the remaining progress as 1 − num_timesteps / _total_timesteps.
+        share = min(max(self.elapsed / self.seconds, 1e-6), 1.0)
+        self.model._total_timesteps = int(np.ceil(self.num_timesteps / share))
+        return self.elapsed < self.seconds
+
+
+def _next_multiple(period: int, steps: int) -> int:
+    """The first multiple of ``period`` above ``steps``."""
+    return (steps // period + 1) * period

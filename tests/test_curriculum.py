@@ -1,0 +1,546 @@
+"""Curriculum replay: folds, teachers (eq. 9), difficulty (eq. 10–11), buckets and stages (eq. 12)."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+
+from sb3_kfcv import KFCVReplayBuffer
+from sb3_kfcv.curriculum.difficulty import buckets_by_difficulty, combine_agents, cross_validated_errors
+from sb3_kfcv.curriculum.folds import assign_folds, rows_per_fold
+from sb3_kfcv.curriculum.stages import bucket_shares, stage_at, uniform_share
+
+OBS, ACT = spaces.Box(-np.inf, np.inf, (3,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
+
+
+class Student:
+    """
+    A learner with one agent or more, whose target is the reward and whose Q-values are all 0.
+
+    What critics read is the observation: (serial number / 1000, and two features).
+    """
+
+    critic_input_size = 3
+
+    def __init__(self, n_agents=1):
+        self.n_learning_agents = n_agents
+
+    def critic_inputs(self, batch):
+        return batch.observations
+
+    def td_target(self, batch):
+        return batch.rewards.T
+
+    def q_values(self, inputs):
+        return th.zeros(self.n_learning_agents, len(inputs))
+
+    def live(self, batch):
+        return batch.alive.T
+
+
+def make_buffer(size=60, n_envs=1, n_agents=1, filled=True, **kwargs):
+    """A buffer whose next draw refreshes it."""
+    kwargs = {"n_folds": 3, "teacher_batch_size": 8, "teacher_steps": 2, "first_teacher_steps": 2, "seed": 0, **kwargs}
+    buffer = KFCVReplayBuffer(size, OBS, ACT, device="cpu", n_envs=n_envs, n_agents=n_agents, **kwargs)
+    th.manual_seed(0)
+    buffer.attach(Student(n_agents))
+    buffer.serial = 0
+    buffer.maker = np.random.default_rng(1)
+    if filled:
+        add(buffer, buffer.buffer_size)
+    return buffer
+
+
+def add(buffer, steps, alive=True):
+    """Transitions with serial numbers, random features and random rewards."""
+    n_agents = buffer.rewards.shape[-1]
+    for _ in range(steps):
+        obs = buffer.maker.normal(size=(buffer.n_envs, 3)).astype(np.float32)
+        obs[:, 0] = (buffer.serial + np.arange(buffer.n_envs)) / 1000
+        buffer.serial += buffer.n_envs
+        infos = [
+            {
+                "agent_rewards": buffer.maker.normal(size=n_agents).astype(np.float32),
+                "agent_terminated": np.zeros(n_agents, bool),
+                "agent_alive": np.full(n_agents, alive),
+            }
+            for _ in range(buffer.n_envs)
+        ]
+        zeros = np.zeros(buffer.n_envs)
+        buffer.add(obs, obs, np.zeros((buffer.n_envs, 1)), zeros, zeros, infos)
+
+
+def serials(observations):
+    return (observations[..., 0] * 1000).round().int()
+
+
+# ---- folds
+
+
+@pytest.mark.parametrize("n_folds", [2, 3, 5, 7])
+def test_folds_are_equal_to_within_one_at_every_fill(n_folds):
+    """Any buffer size, and any number of transitions that it holds so far."""
+    for n_rows in (n_folds, 11, 128, 1003):
+        folds = assign_folds(n_rows, n_folds, np.random.default_rng(n_rows))
+        assert len(folds) == n_rows
+        counts = np.cumsum(folds[:, None] == np.arange(n_folds), axis=0)
+        assert (np.ptp(counts, axis=1) <= 1).all()
+
+
+def test_folds_are_drawn_not_dealt():
+    folds = assign_folds(1000, 5, np.random.default_rng(0)).reshape(200, 5)
+    assert len({tuple(run) for run in folds.tolist()}) > 50  # of 120 orders
+
+
+def test_every_row_is_in_its_fold():
+    members = rows_per_fold(np.array([0, 2, 1, 0, 2]), 3)
+    assert [m.tolist() for m in members] == [[0, 3], [2], [1, 4]]
+
+
+@pytest.mark.parametrize("n_envs", [1, 4])
+def test_folds_are_permanent(n_envs):
+    buffer = make_buffer(size=60, n_envs=n_envs, refresh_every=1)
+    before = buffer.folds.copy()
+    for _ in range(5):
+        buffer.sample(8)
+        add(buffer, 7)
+    np.testing.assert_array_equal(buffer.folds, before)
+
+
+# ---- teachers
+
+
+def spy_on_teachers(buffer):
+    """What each teacher is trained on: fold → set of serial numbers, filled as the buffer refreshes."""
+    fed = [set() for _ in range(buffer.n_folds)]
+    values = buffer.teachers.values
+
+    def spied(inputs):
+        if th.is_grad_enabled():
+            assert inputs.shape[0] == buffer.n_folds
+            for seen, own in zip(fed, inputs, strict=True):
+                seen.update(serials(own).tolist())
+        return values(inputs)
+
+    buffer.teachers.values = spied
+    return fed
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_no_transition_ever_reaches_two_teachers(n_envs):
+    """Over many refreshes, while the buffer is overwritten more than twice."""
+    buffer = make_buffer(size=60, n_envs=n_envs, refresh_every=1, teacher_steps=20, filled=False)
+    fed = spy_on_teachers(buffer)
+    for _ in range(30):
+        add(buffer, 5)
+        buffer.sample(4)
+    assert buffer.n_refreshes >= 20
+    assert sum(len(seen) for seen in fed) == len(set.union(*fed))
+    assert min(len(seen) for seen in fed) > 30
+
+
+def test_teacher_k_is_fed_fold_k():
+    buffer = make_buffer(teacher_steps=50, first_teacher_steps=50)
+    fed = spy_on_teachers(buffer)
+    buffer.sample(4)
+    for fold, seen in enumerate(fed):
+        assert seen == set(np.flatnonzero(buffer.folds == fold).tolist())  # serial numbers are row numbers here
+
+
+def test_teachers_start_from_networks_of_their_own():
+    """Not from one another, either."""
+    buffer = make_buffer()
+    values = buffer.teachers.values(th.randn(1, 4, 3))
+    assert len({round(v, 6) for v in values[:, 0, 0].tolist()}) == 3
+
+
+def test_teachers_persist_between_refreshes():
+    buffer = make_buffer(refresh_every=1, teacher_steps=1, teacher_learning_rate=0.0)
+    before = buffer.teachers.values(th.ones(1, 1, 3))
+    for _ in range(3):
+        buffer.sample(4)
+    th.testing.assert_close(buffer.teachers.values(th.ones(1, 1, 3)), before)
+
+
+def learnt_losses(first_teacher_steps):
+    """Losses after one refresh on pure noise: the targets have nothing to do with the inputs."""
+    buffer = make_buffer(size=150, first_teacher_steps=first_teacher_steps, teacher_batch_size=32)
+    buffer.sample(4)
+    stats = buffer.diagnostics()
+    return stats["curriculum/teacher_loss_in_fold"], stats["curriculum/teacher_loss_held_out"]
+
+
+def test_teachers_learn_their_own_fold():
+    assert learnt_losses(600)[0] < 0.5 * learnt_losses(5)[0]
+
+
+def test_teachers_err_more_on_what_they_have_not_seen():
+    in_fold, held_out = learnt_losses(600)
+    assert held_out > 1.5 * in_fold
+
+
+def test_the_dead_teach_nothing():
+    """With all agents dead no teacher gets a gradient."""
+    buffer = make_buffer(filled=False)
+    add(buffer, 30, alive=False)
+    before = buffer.teachers.values(th.ones(1, 1, 3))
+    buffer.sample(4)
+    assert buffer.n_refreshes == 1
+    th.testing.assert_close(buffer.teachers.values(th.ones(1, 1, 3)), before)
+
+
+# ---- difficulty, K = 3 folds and 2 agents by hand
+
+Y = th.tensor([[1.0, 2.0, 3.0], [10.0, 0.0, -10.0]])  # (agents, transitions)
+# Teachers 1, 2, 3 say 0, 1, 3 for agent 0, and 10, 0, −10 for agent 1, whatever the transition: (folds, agents, transitions)
+Q_TEACHER = th.tensor([[0.0, 10.0], [1.0, 0.0], [3.0, -10.0]]).unsqueeze(-1).expand(3, 2, 3)
+FOLDS = th.tensor([0, 1, 2])
+# Agent 0: (1−1)² + (1−3)² = 4;       (2−0)² + (2−3)² = 5;    (3−0)² + (3−1)² = 13
+# Agent 1: (10−0)² + (10+10)² = 500;  (0−10)² + (0+10)² = 200; (−10−10)² + (−10−0)² = 500
+ERRORS = [[4.0, 5.0, 13.0], [500.0, 200.0, 500.0]]
+
+
+def test_eq_10_and_11_by_hand():
+    assert cross_validated_errors(Y, Q_TEACHER, FOLDS).tolist() == ERRORS
+
+
+def test_scores_are_relative_to_each_agents_mean():
+    """Means 22/3 and 400. (4·3/22 + 500/400) / 2, (5·3/22 + 200/400) / 2, (13·3/22 + 500/400) / 2."""
+    scores = combine_agents(th.tensor(ERRORS), th.ones(2, 3))
+    np.testing.assert_allclose(scores, [0.897727, 0.590909, 1.511364], atol=1e-5)
+
+
+def test_an_agents_reward_scale_does_not_matter():
+    scaled = th.tensor(ERRORS) * th.tensor([[1.0], [1e4]])
+    np.testing.assert_allclose(
+        combine_agents(scaled, th.ones(2, 3)), combine_agents(th.tensor(ERRORS), th.ones(2, 3)), rtol=1e-5
+    )
+
+
+def test_scores_are_over_the_living():
+    """Agent 1 is dead in transition 0: its mean is (200 + 500) / 2 = 350; transition 0 is agent 0's 4·3/22 alone."""
+    scores = combine_agents(th.tensor(ERRORS), th.tensor([[1.0, 1, 1], [0, 1, 1]]))
+    np.testing.assert_allclose(scores, [12 / 22, (15 / 22 + 200 / 350) / 2, (39 / 22 + 500 / 350) / 2], rtol=1e-5)
+
+
+def test_the_buffer_scores_each_transition_by_the_teachers_that_have_not_seen_it():
+    """
+    Against a loop over transitions and teachers. Teachers regress on y in units of its spread (y − mean) / std, which
+    each agent's division by its mean error takes out again.
+    """
+    buffer = make_buffer(size=40, n_agents=2)
+    fed = spy_on_teachers(buffer)
+    buffer.sample(4)
+    y = th.as_tensor(buffer.rewards[:, 0].T)
+    y = (y - y.mean(1, keepdim=True)) / y.std(1, keepdim=True)
+    errors = np.zeros((2, 40))
+    for j in range(40):
+        with th.no_grad():
+            values = buffer.teachers.values(th.as_tensor(buffer.observations[j]).unsqueeze(0))
+        for agent in range(2):
+            for teacher in range(3):
+                if j not in fed[teacher] and buffer.folds[j] != teacher:
+                    errors[agent, j] += float(y[agent, j] - values[teacher, agent, 0]) ** 2
+    expected = (errors / errors.mean(axis=1, keepdims=True)).mean(axis=0)
+    np.testing.assert_allclose(buffer.scores, expected, rtol=1e-3)
+
+
+def test_student_scores_are_the_learners_own_squared_errors():
+    """Q is 0, so δ² is the squared reward; over its mean."""
+    buffer = make_buffer(score="student")
+    buffer.sample(4)
+    squared = buffer.rewards[:, 0, 0].astype(float) ** 2
+    np.testing.assert_allclose(buffer.scores, squared / squared.mean(), rtol=1e-4)
+
+
+# ---- buckets
+
+
+def test_buckets_go_from_easy_to_hard():
+    assert buckets_by_difficulty(np.array([0.5, 9.0, 0.1, 3.0, 2.0, 7.0]), 3).tolist() == [0, 2, 0, 1, 1, 2]
+
+
+@pytest.mark.parametrize("n", [5, 6, 7, 99, 100, 1001])
+def test_buckets_are_equal_to_within_one(n):
+    counts = np.bincount(buckets_by_difficulty(np.random.default_rng(0).random(n), 5), minlength=5)
+    assert np.ptp(counts) <= 1
+
+
+def test_equal_scores_still_fill_equal_buckets():
+    assert np.bincount(buckets_by_difficulty(np.ones(30), 5)).tolist() == [6] * 5
+
+
+# ---- stages
+
+
+def test_k_equal_stages_then_the_whole_buffer():
+    """K = 4 over the first 40 % of training: a stage takes 10 %."""
+    at = {0.0: 1, 0.05: 1, 0.11: 2, 0.19: 2, 0.21: 3, 0.31: 4, 0.399: 4, 0.4: 5, 0.7: 5, 1.0: 5}
+    assert {progress: stage_at(progress, 0.4, 4) for progress in at} == at
+
+
+def test_no_curriculum_at_all():
+    assert stage_at(0.0, 0.0, 5) == 6
+    assert uniform_share(0.0, 0.0, 0.1) == 1
+
+
+SHARES = {
+    # Eq. 12: equal shares of C_1 … C_i
+    "cumulative": {1: [1, 0, 0, 0], 2: [1 / 2, 1 / 2, 0, 0], 3: [1 / 3, 1 / 3, 1 / 3, 0], 4: [1 / 4] * 4},
+    "random": {1: [1, 0, 0, 0], 2: [1 / 2, 1 / 2, 0, 0], 3: [1 / 3, 1 / 3, 1 / 3, 0], 4: [1 / 4] * 4},
+    "bucket": {1: [1, 0, 0, 0], 2: [0, 1, 0, 0], 3: [0, 0, 1, 0], 4: [0, 0, 0, 1]},
+    "anti": {1: [0, 0, 0, 1], 2: [0, 0, 1 / 2, 1 / 2], 3: [0, 1 / 3, 1 / 3, 1 / 3], 4: [1 / 4] * 4},
+}
+
+
+@pytest.mark.parametrize("rule", SHARES)
+def test_shares_of_the_stages(rule):
+    for stage, shares in SHARES[rule].items():
+        np.testing.assert_allclose(bucket_shares(stage, 4, rule), shares)
+
+
+def test_lambda_grows_to_one_as_the_curriculum_ends():
+    """From 0.1 in a straight line: at half the curriculum 0.1 + 0.9 / 2 = 0.55."""
+    values = [uniform_share(progress, 0.5, 0.1) for progress in (0.0, 0.25, 0.4, 0.5, 0.9)]
+    np.testing.assert_allclose(values, [0.1, 0.55, 0.82, 1.0, 1.0])
+
+
+def test_lambda_zero_stays_zero_until_the_curriculum_ends():
+    assert [uniform_share(progress, 0.5, 0.0) for progress in (0.0, 0.49, 0.5)] == [0.0, 0.0, 1.0]
+
+
+# ---- draws
+
+N = 600
+
+
+def scored_buffer(progress=0.0, **kwargs):
+    """600 scored transitions: buckets of 200. Refreshed once, and not again."""
+    kwargs = {"score": "student", "refresh_every": 10**6, "lambda_init": 0.0, "curriculum_fraction": 0.5, **kwargs}
+    buffer = make_buffer(size=N, **kwargs)
+    buffer.sample(1)
+    assert buffer.n_refreshes == 1
+    buffer.progress = progress
+    return buffer
+
+
+def true_buckets(buffer):
+    """Buckets told from the squared rewards, not from the buffer's own books."""
+    ranks = (buffer.rewards[:, 0, 0] ** 2).argsort(kind="stable").argsort(kind="stable")
+    return ranks // (N // 3)
+
+
+# Progress of the stages 1, 2, 3 of a curriculum over the first half of training
+PROGRESS = {1: 0.05, 2: 0.2, 3: 0.45}
+
+
+@pytest.mark.parametrize("stage", [1, 2, 3])
+@pytest.mark.parametrize("rule", ["cumulative", "bucket", "anti"])
+def test_minibatches_hold_the_shares_to_within_one_row(rule, stage):
+    """λ = 0: nothing but the buckets of the stage."""
+    buffer = scored_buffer(PROGRESS[stage], stage_rule=rule)
+    buckets = true_buckets(buffer)
+    for batch_size in (7, 32, 100):
+        counts = np.bincount(buckets[buffer.sample(batch_size).rows], minlength=3)
+        assert np.abs(counts - bucket_shares(stage, 3, rule) * batch_size).max() <= 1
+
+
+def test_the_uniform_share_is_part_of_each_minibatch():
+    """λ = 0.4 in stage 1: at least 0.6 · 100 − 1 rows from C_1, and a third of the other 40 on average: 73 in all."""
+    buffer = scored_buffer(lambda_init=0.4)
+    buckets = true_buckets(buffer)
+    counts = [np.count_nonzero(buckets[buffer.sample(100).rows] == 0) for _ in range(300)]
+    assert min(counts) >= 59
+    assert np.mean(counts) == pytest.approx(60 + 40 / 3, abs=0.6)
+
+
+def test_draws_within_a_bucket_are_uniform():
+    buffer = scored_buffer()
+    counts = np.bincount(buffer.sample(20_000).rows, minlength=N)[true_buckets(buffer) == 0]
+    assert counts.sum() == 20_000
+    assert counts.min() > 100 - 50
+    assert counts.max() < 100 + 50  # five standard deviations around 20,000 / 200
+
+
+def test_random_buckets_know_nothing_of_difficulty():
+    buffer = scored_buffer(stage_rule="random")
+    drawn = np.unique(buffer.sample(20_000).rows)
+    assert len(drawn) == N // 3  # stage 1: one bucket of three
+    assert np.bincount(true_buckets(buffer)[drawn], minlength=3).min() > 40  # about 67 of each
+
+
+def test_the_random_control_trains_the_same_teachers():
+    buffer = make_buffer(stage_rule="random")
+    buffer.sample(4)
+    assert "curriculum/teacher_loss_held_out" in buffer.diagnostics()
+
+
+def test_draws_are_uniform_before_the_first_refresh():
+    """Fewer transitions than a teacher's minibatch: nothing can be scored yet."""
+    buffer = make_buffer(size=60, filled=False, teacher_batch_size=50, lambda_init=0.0)
+    add(buffer, 30)
+    rows = buffer.sample(6000).rows
+    assert buffer.n_refreshes == 0
+    counts = np.bincount(rows, minlength=30)
+    assert counts.min() > 200 - 5 * 14
+    assert counts.max() < 200 + 5 * 14
+
+
+def test_new_transitions_are_never_drawn_without_a_uniform_share():
+    buffer = scored_buffer(PROGRESS[3])
+    add(buffer, 100)  # rows 0 … 99
+    assert buffer.sample(20_000).rows.min() >= 100
+
+
+def test_new_transitions_come_through_the_uniform_share():
+    """λ = 0.3 in stage 1: 100 of 600 are new and get 0.3 / 6 = 5 % of the draws."""
+    buffer = scored_buffer(lambda_init=0.3)
+    add(buffer, 100)
+    assert np.mean(buffer.sample(20_000).rows < 100) == pytest.approx(0.05, abs=0.006)
+
+
+def test_a_stage_whose_transitions_are_all_overwritten_draws_uniformly():
+    buffer = scored_buffer()
+    add(buffer, N)
+    assert len(np.unique(buffer.sample(20_000).rows)) == N
+
+
+def test_after_the_curriculum_draws_are_uniform():
+    buffer = scored_buffer(progress=0.5)
+    assert buffer.stage == 4
+    counts = np.bincount(true_buckets(buffer)[buffer.sample(30_000).rows], minlength=3)
+    np.testing.assert_allclose(counts, 10_000, atol=450)
+
+
+def test_after_the_curriculum_nothing_is_refreshed():
+    buffer = make_buffer(refresh_every=1, curriculum_fraction=0.5)
+    buffer.progress = 0.5
+    for _ in range(5):
+        buffer.sample(4)
+        add(buffer, 40)
+    assert buffer.n_refreshes == 0
+
+
+# ---- refreshes
+
+
+def updates_until_refresh(buffer):
+    """How many draws until the next refresh."""
+    before = buffer.n_refreshes
+    for update in range(1, 1000):
+        buffer.sample(4)
+        if buffer.n_refreshes > before:
+            return update
+    raise AssertionError("no refresh in 1000 updates")
+
+
+def test_the_first_draw_refreshes_when_there_is_enough():
+    assert updates_until_refresh(make_buffer()) == 1
+
+
+def test_refreshes_come_every_so_many_updates():
+    buffer = make_buffer(refresh_every=12)
+    assert [updates_until_refresh(buffer) for _ in range(3)] == [1, 12, 12]
+
+
+def test_a_quarter_of_new_transitions_refreshes_sooner():
+    """Not before a quarter of the interval, though: 40 / 4 = 10 updates."""
+    buffer = make_buffer(size=60, refresh_every=40, refresh_fraction=0.25)
+    updates_until_refresh(buffer)
+    add(buffer, 15)
+    assert updates_until_refresh(buffer) == 10
+
+
+def test_fewer_new_transitions_do_not():
+    buffer = make_buffer(size=60, refresh_every=40, refresh_fraction=0.25)
+    updates_until_refresh(buffer)
+    add(buffer, 14)
+    assert updates_until_refresh(buffer) == 40
+
+
+def test_a_refresh_scores_what_is_new():
+    buffer = make_buffer(refresh_every=3)
+    updates_until_refresh(buffer)
+    add(buffer, 20)
+    assert buffer.diagnostics()["curriculum/unscored"] == pytest.approx(20 / 60)
+    updates_until_refresh(buffer)
+    assert buffer.diagnostics()["curriculum/unscored"] == 0
+
+
+def test_the_first_refresh_takes_more_steps():
+    steps = []
+    buffer = make_buffer(refresh_every=1, first_teacher_steps=7, teacher_steps=3)
+    fit = buffer.teachers.fit
+    buffer.teachers.fit = lambda rows, read, n, *args: steps.append(n) or fit(rows, read, n, *args)
+    for _ in range(3):
+        buffer.sample(4)
+    assert steps == [7, 3, 3]
+
+
+@pytest.mark.parametrize("teacher_batch_size", [128])
+def test_a_buffer_smaller_than_a_teachers_minibatch_still_gets_its_curriculum(teacher_batch_size):
+    """Full, it never grows any further: waiting for more would be waiting for ever."""
+    buffer = make_buffer(size=60, teacher_batch_size=teacher_batch_size)
+    buffer.sample(4)
+    assert buffer.n_refreshes == 1
+
+
+# ---- what it shows
+
+
+def test_diagnostics_of_section_6():
+    buffer = make_buffer(refresh_every=1)
+    for _ in range(2):
+        buffer.sample(4)
+    stats = buffer.diagnostics()
+    expected = {
+        "stage",
+        "lambda",
+        "share_bucket_1",
+        "share_bucket_3",
+        "score_bucket_1_q50",
+        "rank_correlation_with_last",
+        "rank_correlation_with_student",
+        "teacher_loss_in_fold",
+        "teacher_loss_held_out",
+        "scores",
+    }
+    assert {f"curriculum/{name}" for name in expected} | {"time/refresh_seconds"} <= set(stats)
+
+
+def test_score_quantiles_rise_from_bucket_to_bucket():
+    stats = scored_buffer().diagnostics()
+    medians = [stats[f"curriculum/score_bucket_{i}_q50"] for i in (1, 2, 3)]
+    assert medians == sorted(medians)
+    assert stats["curriculum/score_bucket_1_q90"] <= stats["curriculum/score_bucket_2_q10"]
+
+
+def test_scores_by_the_student_correlate_fully_with_the_student():
+    assert scored_buffer().diagnostics()["curriculum/rank_correlation_with_student"] == pytest.approx(1)
+
+
+# ---- settings
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"n_folds": 61}, r"n_folds.*60.*61"),
+        ({"n_folds": 1}, r"n_folds.*got 1"),
+        ({"stage_rule": "cumulativ"}, r'unknown stage_rule "cumulativ".*"cumulative"'),
+        ({"score": "teacher"}, r'unknown score "teacher".*"teachers"'),
+        ({"lambda_init": 1.2}, r"lambda_init.*1\.2"),
+        ({"curriculum_fraction": -0.1}, r"curriculum_fraction.*-0\.1"),
+    ],
+)
+def test_settings_out_of_range_are_refused_by_name(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        make_buffer(**kwargs)
+
+
+@pytest.mark.parametrize("kwargs", [{"n_folds": 2.5}, {"teacher_steps": 0}, {"first_teacher_steps": 0}, {"teacher_batch_size": 0}])
+def test_counts_that_are_no_counts_are_refused_by_name(kwargs):
+    """Before any time is spent: when the buffer is made."""
+    (name,) = kwargs
+    with pytest.raises((ValueError, TypeError), match=name):
+        make_buffer(filled=False, **kwargs)

@@ -1,0 +1,298 @@
+"""A stack of networks is what as many separate networks are: outputs, gradients, Adam steps, clipping."""
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from references import one_hot_networks, plain_mlp, with_one_hot
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.td3.policies import Actor, ContinuousCritic
+from torch import nn
+
+from sb3_kfcv.common.layout import AgentLayout
+from sb3_kfcv.common.stacked_networks import StackedMLP
+from sb3_kfcv.maddpg.policies import StackedActors, StackedCritics
+
+SIZES = [5, 7, 6, 2]
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    th.manual_seed(0)
+
+
+def close(one, other, atol=1e-6):
+    th.testing.assert_close(one, other, atol=atol, rtol=1e-5)
+
+
+def separate(stack):
+    return [stack.network(i) for i in range(stack.n_networks)]
+
+
+def spread_inputs(stack, x):
+    """What each network reads, from the stack's inputs."""
+    return x.repeat_interleave(stack.n_networks // len(x), dim=0)
+
+
+# own inputs (None), one for all (1), one per run of two networks (3)
+N_INPUTS = [None, 1, 3]
+
+
+def stack_and_input(n_inputs, batch=4):
+    stack = StackedMLP(6, SIZES, n_inputs=n_inputs)
+    return stack, th.randn(6 if n_inputs is None else n_inputs, batch, SIZES[0])
+
+
+@pytest.mark.parametrize("n_inputs", N_INPUTS)
+def test_outputs_are_those_of_separate_networks(n_inputs):
+    stack, x = stack_and_input(n_inputs)
+    expected = th.stack([net(own) for net, own in zip(separate(stack), spread_inputs(stack, x), strict=True)])
+    close(stack(x), expected)
+
+
+def test_network_is_made_of_linear_layers_and_activations():
+    layers = list(StackedMLP(2, SIZES, nn.Tanh).network(1))
+    assert [type(layer) for layer in layers] == [nn.Linear, nn.Tanh, nn.Linear, nn.Tanh, nn.Linear]
+    assert [tuple(layer.weight.shape) for layer in layers[::2]] == [(7, 5), (6, 7), (2, 6)]
+
+
+def test_network_is_a_copy():
+    stack, x = stack_and_input(None)
+    before = stack(x)
+    nn.init.zeros_(stack.network(0)[0].weight)
+    close(stack(x), before)
+
+
+@pytest.mark.parametrize("n_inputs", N_INPUTS)
+def test_adam_steps_are_those_of_separate_networks(n_inputs):
+    stack, x = stack_and_input(n_inputs)
+    plain = separate(stack)
+    stacked_adam = th.optim.Adam(stack.parameters(), lr=1e-2)
+    plain_adams = [th.optim.Adam(net.parameters(), lr=1e-2) for net in plain]
+    target = th.randn(6, 4, SIZES[-1])
+    for _ in range(5):
+        stacked_adam.zero_grad()
+        (stack(x) - target).square().mean((1, 2)).sum().backward()
+        stacked_adam.step()
+        for net, adam, own, y in zip(plain, plain_adams, spread_inputs(stack, x), target, strict=True):
+            adam.zero_grad()
+            (net(own) - y).square().mean().backward()
+            adam.step()
+    for i, net in enumerate(plain):
+        for ours, theirs in zip(stack.network(i).parameters(), net.parameters(), strict=True):
+            close(ours, theirs, atol=1e-5)
+
+
+def as_separate_gradients(stack):
+    """The gradient of each network of a stack: a plain gradient-descent step of size 1 moves by minus the gradient."""
+    before = separate(stack)
+    with th.no_grad():
+        for parameter in stack.parameters():
+            parameter.sub_(parameter.grad)
+    after = separate(stack)
+    return [
+        [a - b for a, b in zip(old.parameters(), new.parameters(), strict=True)]
+        for old, new in zip(before, after, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("n_inputs", N_INPUTS)
+def test_gradients_are_clipped_network_by_network(n_inputs):
+    """Losses of very different sizes, so that some networks are clipped and some are not."""
+    stack, x = stack_and_input(n_inputs)
+    plain = separate(stack)
+    scales = th.tensor([1e-3, 1.0, 10.0, 1e-2, 100.0, 0.3])
+    (stack(x).square().mean((1, 2)) * scales).sum().backward()
+    norms = []
+    for net, own, scale in zip(plain, spread_inputs(stack, x), scales, strict=True):
+        (net(own).square().mean() * scale).backward()
+        norms.append(nn.utils.clip_grad_norm_(net.parameters(), 0.05))
+    assert min(norms) < 0.05 < max(norms)
+    close(stack.gradient_norms(), th.stack(norms))
+    stack.clip_gradients(0.05)
+    for ours, net in zip(as_separate_gradients(stack), plain, strict=True):
+        for one, other in zip(ours, net.parameters(), strict=True):
+            close(one, other.grad, atol=2e-6)
+
+
+def test_new_networks_are_drawn_as_nn_linear_draws():
+    """nn.Linear draws weights and biases evenly from ±1/√inputs: standard deviation 1/√(3·inputs)."""
+    stack = StackedMLP(40, [16, 50, 1], n_inputs=1)
+    assert stack.network(39)[0].weight.abs().max() <= 0.25
+    for layer, inputs in ((0, 16), (2, 50)):
+        drawn = th.cat([net[layer].weight.flatten() for net in separate(stack)])
+        assert drawn.std().item() == pytest.approx((3 * inputs) ** -0.5, rel=0.05)
+
+
+# ---- members that share a network
+
+MEMBERS = [0, 0, 1, 0, 1]
+
+
+@pytest.mark.parametrize("n_inputs", [None, 1])
+def test_sharing_is_a_one_hot_number_in_the_input(n_inputs):
+    stack = StackedMLP(2, SIZES, n_inputs=n_inputs, members=MEMBERS)
+    x = th.randn(5 if n_inputs is None else 1, 4, SIZES[0])
+    nets = one_hot_networks(stack)
+    outputs = stack(x)
+    for member, net in enumerate(MEMBERS):
+        own = x[member if n_inputs is None else 0]
+        close(outputs[member], nets[net](with_one_hot(own, member, 5)))
+        close(outputs[member], stack.network(member)(own))
+
+
+@pytest.mark.parametrize("n_inputs", [None, 1])
+def test_shared_networks_learn_as_networks_with_a_one_hot_number(n_inputs):
+    stack = StackedMLP(2, SIZES, n_inputs=n_inputs, members=MEMBERS)
+    x = th.randn(5 if n_inputs is None else 1, 4, SIZES[0])
+    inputs = x.expand(5, -1, -1)
+    nets = one_hot_networks(stack)
+    target = th.randn(5, 4, SIZES[-1])
+    adam = th.optim.Adam(stack.parameters(), lr=1e-2)
+    plain_adam = th.optim.Adam([p for net in nets for p in net.parameters()], lr=1e-2)
+
+    def clip_and_step():
+        stack.clip_gradients(0.1)
+        adam.step()
+        for net in nets:
+            nn.utils.clip_grad_norm_(net.parameters(), 0.1)
+        plain_adam.step()
+
+    for _ in range(3):
+        adam.zero_grad()
+        plain_adam.zero_grad()
+        (stack(x) - target).square().mean((1, 2)).sum().backward()
+        for member, net in enumerate(MEMBERS):
+            (nets[net](with_one_hot(inputs[member], member, 5)) - target[member]).square().mean().backward()
+        clip_and_step()
+    outputs = stack(x)
+    for member, net in enumerate(MEMBERS):
+        close(outputs[member], nets[net](with_one_hot(inputs[member], member, 5)), atol=1e-5)
+
+
+# ---- actors and critics of a world
+
+LAYOUTS = {
+    "one block": AgentLayout(("a_0", "a_1", "a_2"), ("a",) * 3, (3, 3, 3), (2, 2, 2)),
+    # blocks: agents 0, 2 and 3; agent 1
+    "several blocks": AgentLayout(("a_0", "b_0", "a_1", "a_2"), ("a", "b", "a", "a"), (3, 4, 3, 3), (2, 1, 2, 2)),
+}
+
+
+@pytest.fixture(params=LAYOUTS)
+def layout(request):
+    return LAYOUTS[request.param]
+
+
+def critics_of(layout, agents=None, **kwargs):
+    size = sum(layout.obs_sizes) + sum(layout.action_sizes)
+    return StackedCritics(layout, range(layout.n_agents) if agents is None else agents, size, [8, 6], **kwargs)
+
+
+def in_blocks(critics, per_agent):
+    """Per-agent actions {agent: (batch, action)} as the per-block tensors that the stacks speak in."""
+    return [th.stack([per_agent[i] for i in block.agents]) for block in critics.blocks]
+
+
+def test_actors_equal_separate_sb3_actors(layout):
+    actors = StackedActors(layout, range(layout.n_agents), [8, 6])
+    observations = th.randn(5, sum(layout.obs_sizes))
+    joint = actors(observations)
+    for block, actions in zip(actors.blocks, joint, strict=True):
+        for agent, own in zip(block.agents, actions, strict=True):
+            theirs = sb3_actor(layout.obs_sizes[agent], layout.action_sizes[agent])
+            load_linears(theirs.mu, actors.network(agent))
+            close(own, theirs(observations[:, layout.obs_slices[agent]]))
+
+
+def test_critics_equal_separate_sb3_critics(layout):
+    critics = critics_of(layout, n_critics=2)
+    n_obs, n_actions = sum(layout.obs_sizes), sum(layout.action_sizes)
+    observations, actions = th.randn(5, n_obs), th.rand(5, n_actions) * 2 - 1
+    q_values = critics(th.cat([observations, actions], dim=1))
+    assert q_values.shape == (2, layout.n_agents, 5)
+    for agent in range(layout.n_agents):
+        theirs = sb3_critic(n_obs, n_actions)
+        for number, network in enumerate(theirs.q_networks):
+            load_linears(network, critics.network(agent, number))
+        for ours, value in zip(q_values[:, agent], theirs(observations, actions), strict=True):
+            close(ours, value.squeeze(1))
+
+
+def box(size):
+    return spaces.Box(-1, 1, (size,), np.float32)
+
+
+def sb3_actor(n_obs, n_actions):
+    space = box(n_obs)
+    return Actor(space, box(n_actions), [8, 6], FlattenExtractor(space), n_obs)
+
+
+def sb3_critic(n_obs, n_actions):
+    space = box(n_obs)
+    return ContinuousCritic(space, box(n_actions), [8, 6], FlattenExtractor(space), n_obs, n_critics=2)
+
+
+def load_linears(target, source):
+    linears = [layer for layer in target if isinstance(layer, nn.Linear)]
+    for ours, theirs in zip(linears, [layer for layer in source if isinstance(layer, nn.Linear)], strict=True):
+        ours.load_state_dict(theirs.state_dict())
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_own_action_replaced_equals_a_plain_evaluation_and_its_gradient(layout, share):
+    """Eq. 6: Q_i(s, a_1 … π_i(o_i) … a_N), and ∇_a of it, agent by agent through the whole critic."""
+    critics = critics_of(layout, share_parameters=share)
+    n_obs = sum(layout.obs_sizes)
+    inputs = th.randn(5, n_obs + sum(layout.action_sizes))
+    new = {i: th.randn(5, layout.action_sizes[i], requires_grad=True) for i in range(layout.n_agents)}
+    plain_new = {i: value.detach().clone().requires_grad_() for i, value in new.items()}
+
+    q_values = critics.with_own_actions(inputs, in_blocks(critics, new))
+    weights = th.randn_like(q_values)
+    (q_values * weights).sum().backward()
+
+    for i in range(layout.n_agents):
+        columns = layout.action_slices[i]
+        before, after = inputs[:, : n_obs + columns.start], inputs[:, n_obs + columns.stop :]
+        plain = critics.network(i)(th.cat([before, plain_new[i], after], dim=1)).squeeze(1)
+        close(q_values[i], plain, atol=1e-5)
+        (plain * weights[i]).sum().backward()
+        close(new[i].grad, plain_new[i].grad, atol=1e-5)
+
+
+def test_own_action_replaced_for_some_of_the_agents():
+    """A team: agents 1 and 3 learn; the critics still read everyone's actions."""
+    layout = LAYOUTS["several blocks"]
+    critics = critics_of(layout, agents=[1, 3])
+    n_obs = sum(layout.obs_sizes)
+    inputs = th.randn(5, n_obs + sum(layout.action_sizes))
+    new = {i: th.randn(5, layout.action_sizes[i]) for i in (1, 3)}
+    q_values = critics.with_own_actions(inputs, in_blocks(critics, new))
+    for position, i in enumerate((1, 3)):
+        moved = inputs.clone()
+        moved[:, n_obs:][:, layout.action_slices[i]] = new[i]
+        close(q_values[position], critics.network(position)(moved).squeeze(1), atol=1e-5)
+
+
+def test_the_actors_step_gives_the_critics_no_gradient(layout):
+    critics = critics_of(layout)
+    inputs = th.randn(5, sum(layout.obs_sizes) + sum(layout.action_sizes))
+    new = {i: th.randn(5, layout.action_sizes[i], requires_grad=True) for i in range(layout.n_agents)}
+    critics.with_own_actions(inputs, in_blocks(critics, new)).sum().backward()
+    assert all(parameter.grad is None for parameter in critics.parameters())
+
+
+def test_each_actor_reads_its_own_observation_alone(layout):
+    actors = StackedActors(layout, range(layout.n_agents), [8, 6])
+    observations = th.randn(1, sum(layout.obs_sizes))
+    changed = observations.clone()
+    changed[:, layout.obs_slices[1]] += 1
+    before, after = actors(observations), actors(changed)
+    moved = {
+        agent
+        for block, old, new in zip(actors.blocks, before, after, strict=True)
+        for agent, one, other in zip(block.agents, old, new, strict=True)
+        if not th.equal(one, other)
+    }
+    assert moved == {1}

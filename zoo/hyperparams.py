@@ -1,0 +1,263 @@
+"""Hyperparameters of a run: the YAML entry, its preset and the command line, merged and checked before anything is built."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import yaml
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_kfcv import ALGOS
+from sb3_kfcv.common.naming import unknown_name
+from sb3_kfcv.maddpg import MADDPG
+from sb3_kfcv.vec_env.make import WORLDS
+from zoo.typed_settings import checked, resolve_classes, settings_of
+
+HYPERPARAMS = Path(__file__).parents[1] / "hyperparams"
+PRESETS = ("default", "tuned")
+
+# Constructor arguments that are flags of the command line, or not for a file to say.
+FLAGS = ("seed", "device", "verbose", "tensorboard_log")
+NOT_SETTABLE = (
+    *("self", "policy", "env", "action_noise", "replay_buffer_class", "optimize_memory_usage", "_init_setup_model"),
+    *FLAGS,
+)
+# What the algorithm itself tells its buffer and its policy.
+GIVEN_TO_BUFFER = (
+    *("self", "buffer_size", "observation_space", "action_space", "device", "n_envs", "optimize_memory_usage"),
+    *("n_agents", "state_size", "seed"),
+)
+GIVEN_TO_POLICY = (
+    *("self", "observation_space", "action_space", "lr_schedule", "layout", "agents", "critic_input_size"),
+    "share_parameters",
+)
+OF_THE_RUN = {
+    "n_timesteps": int,
+    "n_envs": int,
+    "policy": str,
+    "normalize": bool | dict[str, Any],
+    "env_kwargs": dict[str, Any],
+}
+LINEAR = re.compile(r"lin_(.+)")
+
+
+@dataclass
+class Hyperparams:
+    """
+    The checked settings of a run.
+
+    :param algo: name of the algorithm
+    :param env_id: id of the world
+    :param n_timesteps: env steps to train
+    :param n_envs: worlds that train side by side
+    :param policy: name of the policy class
+    :param normalize: arguments of ``VecNormalize``; ``None`` goes without
+    :param env_kwargs: settings of the world
+    :param model: arguments of the algorithm's constructor, as YAML holds them
+    """
+
+    algo: str
+    env_id: str
+    n_timesteps: int
+    n_envs: int = 1
+    policy: str = "MlpPolicy"
+    normalize: dict[str, Any] | None = None
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    model: dict[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as an entry of a YAML file."""
+        run = {name: getattr(self, name) for name in ("n_timesteps", "n_envs", "policy", "env_kwargs")}
+        return {**run, "normalize": self.normalize or False, **self.model}
+
+    def model_kwargs(self, names: Sequence[str] | None = None) -> dict[str, Any]:
+        """
+        Arguments for the algorithm's constructor: schedules and classes in place of their names.
+
+        :param names: only these; all by default
+        """
+        kwargs = deepcopy({name: self.model[name] for name in (self.model if names is None else names)})
+        if isinstance(kwargs.get("learning_rate"), str):
+            kwargs["learning_rate"] = LinearSchedule(_start_of_schedule(kwargs["learning_rate"]), 0.0, 1.0)
+        if isinstance(kwargs.get("train_freq"), list):
+            kwargs["train_freq"] = tuple(kwargs["train_freq"])
+        if "policy_kwargs" in kwargs:
+            kwargs["policy_kwargs"] = resolve_classes(kwargs["policy_kwargs"], _policy_settings(self.algo, self.policy))
+        return kwargs
+
+
+def find_algorithm(name: str) -> type[MADDPG]:
+    """
+    :raises ValueError: for an unknown algorithm, with the nearest one
+    """
+    if name not in ALGOS:
+        raise ValueError(unknown_name("algorithm", name, ALGOS))
+    return ALGOS[name]
+
+
+def load_entry(algo: str, env_id: str, conf_file: str | Path | None = None, preset: str = "default") -> dict[str, Any]:
+    """
+    The entry of a world in a YAML file, unchecked.
+
+    :param algo: name of the algorithm, whose file is read unless another one is given
+    :param env_id: id of the world
+    :param conf_file: another file
+    :param preset: ``"default"``, or ``"tuned"``: with the values of the entry's ``tuned`` map in place of the defaults
+    :raises ValueError: if there is no such entry
+    """
+    path = Path(conf_file) if conf_file else HYPERPARAMS / f"{algo}.yml"
+    entries = read_map(path)
+    if env_id not in entries:
+        if env_id in gym.registry:
+            raise ValueError(f"{path} has no entry for {env_id}; it has {', '.join(map(str, entries))}")
+        raise ValueError(unknown_name("environment", env_id, [*WORLDS, *gym.registry]))
+    entry = entries[env_id]
+    if not isinstance(entry, dict):
+        raise ValueError(f"the entry of {env_id} in {path} is {entry!r}; it must be a map")
+    tuned = entry.pop("tuned", None)
+    if preset not in PRESETS:
+        raise ValueError(unknown_name("preset", preset, PRESETS))
+    if preset == "default":
+        return entry
+    if not isinstance(tuned, dict):
+        raise ValueError(f"the entry of {env_id} in {path} has no map {preset!r}")
+    return merged(entry, tuned)
+
+
+def read_map(path: Path) -> dict[str, Any]:
+    """
+    A YAML file that holds a map.
+
+    :raises ValueError: if it is missing, no YAML, or something else
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} holds no map of settings")
+    return content
+
+
+def parse_pairs(flag: str, pairs: Sequence[str]) -> dict[str, Any]:
+    """
+    ``key:value`` pairs of the command line; a dot in the key goes into a nested map.
+
+    :param flag: for the message
+    :param pairs: such as ``["gamma:0.95", "policy_kwargs.n_critics:2"]``
+    :raises ValueError: for a text that is no pair
+    """
+    result: dict[str, Any] = {}
+    for pair in pairs:
+        key, colon, text = pair.partition(":")
+        if not colon or not key:
+            raise ValueError(f'{flag} takes key:value, such as gamma:0.95; got "{pair}"')
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError:
+            raise ValueError(f'{flag} {key}: "{text}" is no valid YAML value') from None
+        for part in reversed(key.split(".")):
+            value = {part: value}
+        result = merged(result, value)
+    return result
+
+
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """``base`` with the values of ``over``, nested maps merged likewise."""
+    result = dict(base)
+    for key, value in over.items():
+        both_maps = isinstance(value, dict) and isinstance(result.get(key), dict)
+        result[key] = merged(result[key], value) if both_maps else value
+    return result
+
+
+def check(algo: str, env_id: str, entry: Mapping[str, Any]) -> Hyperparams:
+    """
+    Check every name and type of an entry.
+
+    :param algo: name of the algorithm
+    :param env_id: id of the world
+    :param entry: name → value
+    :raises ValueError: names what is wrong and the nearest right name
+    """
+    algorithm = find_algorithm(algo)
+    for flag in FLAGS:
+        if flag in entry:
+            raise ValueError(f"{flag} is no hyperparameter: give it with --{flag.replace('_', '-')}")
+    if "norm_reward" in entry:
+        raise ValueError(_norm_reward_refusal())
+    of_the_model = {**settings_of(algorithm, NOT_SETTABLE), "learning_rate": float | str}  # text for a schedule
+    settings = checked("hyperparameter", entry, {**OF_THE_RUN, **of_the_model})
+    run = {name: settings.pop(name) for name in OF_THE_RUN if name in settings}
+    for name in ("n_timesteps", "n_envs"):
+        if name not in run:
+            raise ValueError(f"hyperparameter {name} is missing")
+        if run[name] < 1:
+            raise ValueError(f"hyperparameter {name} is {run[name]}; it must be at least 1")
+    run["normalize"] = _checked_normalize(run.get("normalize", False))
+    run["env_kwargs"] = check_env_kwargs(env_id, run.get("env_kwargs", {}))
+    if run.setdefault("policy", "MlpPolicy") not in algorithm.policy_aliases:
+        raise ValueError(unknown_name("policy", run["policy"], algorithm.policy_aliases))
+    if isinstance(settings.get("learning_rate"), str):
+        _start_of_schedule(settings["learning_rate"])
+    settings["policy_kwargs"] = checked(
+        "setting of policy_kwargs", settings.get("policy_kwargs") or {}, _policy_settings(algo, run["policy"])
+    )
+    settings["replay_buffer_kwargs"] = checked(
+        f"setting of replay_buffer_kwargs ({algorithm.default_buffer_class.__name__})",
+        settings.get("replay_buffer_kwargs") or {},
+        settings_of(algorithm.default_buffer_class, GIVEN_TO_BUFFER),
+    )
+    return Hyperparams(algo, env_id, model=settings, **run)
+
+
+def check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Check the settings of one of the project's worlds; those of other envs cannot be known and pass.
+
+    :raises ValueError: for an unknown one, with the nearest one, and for a value of another type
+    """
+    if env_id not in WORLDS:
+        return dict(env_kwargs)
+    return checked(f"setting of {env_id}", env_kwargs, settings_of(WORLDS[env_id], ("self", "n_worlds")))
+
+
+def _checked_normalize(normalize: bool | dict[str, Any]) -> dict[str, Any] | None:
+    if normalize is False:
+        return None
+    given = {} if normalize is True else normalize
+    if given.get("norm_reward"):
+        raise ValueError(_norm_reward_refusal())
+    known = settings_of(VecNormalize, ("self", "venv", "training", "norm_obs_keys", "clip_reward", "gamma"))
+    return {"norm_obs": True, **checked("setting of normalize", given, known), "norm_reward": False}
+
+
+def _norm_reward_refusal() -> str:
+    return "norm_reward: true cannot reach the agents' own rewards, which the critics learn; use reward_scale instead"
+
+
+def _policy_settings(algo: str, policy: str) -> dict[str, Any]:
+    return settings_of(ALGOS[algo].policy_aliases[policy], GIVEN_TO_POLICY)
+
+
+def _start_of_schedule(text: str) -> float:
+    """
+    Where a schedule such as ``lin_1e-3`` starts; it falls linearly to 0.
+
+    :raises ValueError: for anything else
+    """
+    match = LINEAR.fullmatch(text)
+    try:
+        return float(match.group(1) if match else "")
+    except ValueError:
+        message = f'hyperparameter learning_rate is "{text}"; it must be a number, or a linear schedule such as lin_1e-3'
+        raise ValueError(message) from None

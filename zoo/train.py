@@ -1,0 +1,361 @@
+"""
+Train an agent team: ``python zoo/train.py --algo kfcv_maddpg --env Grassland-v0``.
+
+Flags and the layout of the run folder are those of rl-baselines3-zoo. Hyperparameters come from ``hyperparams/<algo>.yml``,
+its preset, and the command line, the later ones winning.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+import yaml
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import each other as the package ``zoo``
+
+from sb3_kfcv.common.callbacks import MultiAgentEvalCallback, PeriodicCheckpoint, StopOnSignal
+from sb3_kfcv.common.naming import unknown_name
+from sb3_kfcv.common.normalization import load_normalization, save_model
+from sb3_kfcv.maddpg import MADDPG
+from sb3_kfcv.vec_env.make import layout_of, make_vec_env, metric_names_of
+from zoo.hyperparams import (
+    PRESETS,
+    Hyperparams,
+    check,
+    check_env_kwargs,
+    find_algorithm,
+    load_entry,
+    merged,
+    parse_pairs,
+    read_map,
+)
+from zoo.run_folder import RunFolder, file_name
+
+BAD_INPUT = 2  # exit status, as of argparse
+SIGNALLED = 128  # plus the number of the signal: 130 after Ctrl-C, 143 after SIGTERM
+
+# Worlds of the evaluation are seeded this far above those of the training, which are seed, seed + 1, …
+EVAL_SEED_OFFSET = 1_000_000
+
+# Without --log-interval: log once per so many episodes of each world.
+EPISODES_PER_LOG = 4
+
+# Flags that a continued run takes over from the one it continues.
+CARRIED_FLAGS = (
+    *("log_folder", "tensorboard_log", "eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "log_interval"),
+    *("num_threads", "device", "verbose"),
+)
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one sentence, by an exception."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(message)
+
+    def parse_all(self, argv: Sequence[str] | None) -> argparse.Namespace:
+        """
+        :raises ValueError: for bad usage; for an unknown flag, with the nearest one
+        """
+        args, unknown = self.parse_known_args(argv)
+        if unknown:
+            raise ValueError(unknown_name("flag", unknown[0], [*self._option_string_actions]))
+        return args
+
+
+def make_parser() -> Parser:
+    """The command line."""
+    parser = Parser(description="Train multi-agent algorithms.", allow_abbrev=False)
+    add = parser.add_argument
+    add("--algo", default="kfcv_maddpg", help="maddpg, per_maddpg or kfcv_maddpg (default: %(default)s)")
+    add("--env", default="Grassland-v0", help="id of the world (default: %(default)s)")
+    add("-n", "--n-timesteps", type=whole_number, default=-1, help="env steps; with -i so many more (default: the YAML's)")
+    add("--seed", type=int, default=-1, help="-1 draws one at random and prints it (default: %(default)s)")
+    add("-f", "--log-folder", default="logs", help="where run folders are made (default: %(default)s)")
+    add("-tb", "--tensorboard-log", help='TensorBoard folder (default: the run folder); "" turns it off')
+    add("-P", "--progress", action="store_true", help="show a progress bar with the time left")
+    add("--eval-freq", type=whole_number, default=25_000, help="env steps between evaluations, -1: none (default: %(default)s)")
+    add("--eval-episodes", type=int, default=20, help="episodes per evaluation (default: %(default)s)")
+    add("--n-eval-envs", type=int, default=20, help="worlds that evaluate side by side (default: %(default)s)")
+    add("--save-freq", type=whole_number, default=-1, help="env steps between checkpoints, -1: none (default: %(default)s)")
+    add("--save-replay-buffer", action="store_true", help="save the replay buffer with every checkpoint and at the end")
+    add("--log-interval", type=int, default=-1, help=f"episodes between logs; -1: {EPISODES_PER_LOG} per world, -2: off")
+    pairs: dict[str, Any] = {"nargs": "+", "action": "extend", "default": [], "metavar": "KEY:VALUE"}
+    add("-params", "--hyperparams", **pairs, help="overwrite hyperparameters, such as gamma:0.95 policy_kwargs.n_critics:2")
+    add("--env-kwargs", **pairs, help="settings of the world, such as n_wolves:4")
+    add("--eval-env-kwargs", **pairs, help="settings of the evaluation's worlds where they differ")
+    add("-conf", "--conf-file", help="YAML file of hyperparameters (default: hyperparams/<algo>.yml)")
+    add("--preset", help=f"{' or '.join(PRESETS)}: what learns better in place of the paper's values")
+    add("-i", "--trained-agent", help="a saved model to continue, with the replay_buffer.npz beside it if there is one")
+    add("--team", help="learn only this group of agents")
+    add("--opponents", **{**pairs, "metavar": "GROUP:NAME"}, help="scripted policy of each other group, such as sheep:flee")
+    add("--num-threads", type=int, default=1, help="threads of PyTorch (default: %(default)s)")
+    add("--device", type=device, default="auto", help="auto, cpu, cuda (default: %(default)s)")
+    add("--verbose", type=int, default=1, help="0: quiet, 1: info (default: %(default)s)")
+    return parser
+
+
+def whole_number(text: str) -> int:
+    """A whole number, also as ``1e6``."""
+    try:
+        number = float(text)
+        if number == int(number):
+            return int(number)
+    except (ValueError, OverflowError):
+        pass
+    raise argparse.ArgumentTypeError(f'"{text}" is no whole number')
+
+
+def device(text: str) -> str:
+    """The name of a PyTorch device, or ``auto``."""
+    try:
+        return text if text == "auto" else str(th.device(text))
+    except RuntimeError:
+        raise argparse.ArgumentTypeError(f'"{text}" is no device; give auto, cpu or cuda') from None
+
+
+@dataclass
+class Training:
+    """
+    All that a run needs, built and checked.
+
+    :param args: the command line, its seed resolved
+    :param hyperparams: the settings
+    :param model: the learner
+    :param eval_env: worlds of the evaluation; ``None`` without evaluations
+    :param n_timesteps: env steps still to go
+    """
+
+    args: argparse.Namespace
+    hyperparams: Hyperparams
+    model: MADDPG
+    eval_env: VecEnv | None
+    n_timesteps: int
+
+
+def resolve(args: argparse.Namespace) -> Hyperparams:
+    """
+    The settings of a run: YAML or the continued run's, then the command line.
+
+    :raises ValueError: for whatever is unknown or of another type
+    """
+    find_algorithm(args.algo)
+    entry = load_entry(args.algo, args.env, args.conf_file, args.preset or "default")
+    if args.trained_agent:
+        model_path = Path(args.trained_agent)
+        if not model_path.is_file():
+            raise ValueError(f"there is no model {model_path}")
+        config = RunFolder.of_model(model_path, args.env).config_file
+        if config.exists():
+            if args.preset or args.conf_file:
+                raise ValueError(f"a continued run keeps its settings ({config}); change single ones with -params")
+            entry = read_map(config)
+    entry = merged(entry, parse_pairs("-params", args.hyperparams))
+    entry = merged(entry, {"env_kwargs": parse_pairs("--env-kwargs", args.env_kwargs)})
+    if args.team:
+        entry["team"] = args.team
+    if args.opponents:
+        entry["opponents"] = parse_pairs("--opponents", args.opponents)
+    if args.n_timesteps != -1 and not args.trained_agent:
+        entry["n_timesteps"] = args.n_timesteps
+    return check(args.algo, args.env, entry)
+
+
+def make_env(hyperparams: Hyperparams, n_envs: int, seed: int, env_kwargs: dict[str, Any], training: bool) -> VecEnv:
+    """
+    Worlds to train or to evaluate in.
+
+    :param hyperparams: the settings
+    :param n_envs: number of worlds
+    :param seed: of the first world; the others follow
+    :param env_kwargs: settings of the worlds
+    :param training: whether observation statistics are gathered, if observations are normalised
+    """
+    env = make_vec_env(hyperparams.env_id, n_envs, seed, env_kwargs)
+    return env if hyperparams.normalize is None else VecNormalize(env, training=training, **hyperparams.normalize)
+
+
+def make_eval_env(args: argparse.Namespace, hyperparams: Hyperparams, env: VecEnv) -> VecEnv | None:
+    """
+    Worlds of the evaluation.
+
+    :param args: the command line
+    :param hyperparams: the settings
+    :param env: the worlds of the training, to whose agents these must be alike
+    """
+    different = check_env_kwargs(args.env, parse_pairs("--eval-env-kwargs", args.eval_env_kwargs))
+    if args.eval_freq <= 0:
+        return None
+    for flag in ("eval_episodes", "n_eval_envs"):
+        if getattr(args, flag) < 1:
+            raise ValueError(f"--{flag.replace('_', '-')} is {getattr(args, flag)}; it must be at least 1")
+    n_envs = min(args.n_eval_envs, args.eval_episodes)
+    kwargs = merged(hyperparams.env_kwargs, different)
+    eval_env = make_env(hyperparams, n_envs, args.seed + EVAL_SEED_OFFSET, kwargs, training=False)
+    if layout_of(eval_env) != layout_of(env):
+        raise ValueError(f"--eval-env-kwargs {different} make a world whose agents are not those of the training")
+    return eval_env
+
+
+def build(args: argparse.Namespace) -> Training:
+    """
+    Everything that can be refused, before anything is written.
+
+    :raises ValueError: one sentence that says what is wrong
+    """
+    if args.num_threads < 1:
+        raise ValueError(f"--num-threads is {args.num_threads}; it must be at least 1")
+    hyperparams = resolve(args)
+    th.set_num_threads(args.num_threads)
+    if args.seed < 0:
+        args.seed = int(np.random.default_rng().integers(2**31))
+    env = make_env(hyperparams, hyperparams.n_envs, args.seed, hyperparams.env_kwargs, training=True)
+    eval_env = make_eval_env(args, hyperparams, env)
+    algorithm = find_algorithm(args.algo)
+    settings = {**hyperparams.model_kwargs(), "seed": args.seed, "device": args.device, "verbose": args.verbose}
+    if not args.trained_agent:
+        model = algorithm(hyperparams.policy, env, **settings)
+        return Training(args, hyperparams, model, eval_env, hyperparams.n_timesteps)
+
+    if isinstance(env, VecNormalize):
+        env = load_normalization(args.trained_agent, env.venv, training=True)
+    model = algorithm.load(args.trained_agent, env, replay_buffer_class=algorithm.default_buffer_class, **settings)
+    buffer_file = RunFolder.of_model(args.trained_agent, args.env).replay_buffer
+    if buffer_file.exists():
+        model.load_replay_buffer(buffer_file)
+    to_go = args.n_timesteps if args.n_timesteps > 0 else hyperparams.n_timesteps - model.num_timesteps
+    if to_go <= 0:
+        raise ValueError(f"{args.trained_agent} has its {model.num_timesteps} env steps already; say with -n how many more")
+    hyperparams.n_timesteps = model.num_timesteps + to_go
+    return Training(args, hyperparams, model, eval_env, to_go)
+
+
+def make_callbacks(training: Training, folder: RunFolder) -> list[BaseCallback]:
+    """Evaluations and checkpoints, as the command line wants them."""
+    args = training.args
+    callbacks: list[BaseCallback] = []
+    if args.save_freq > 0:
+        callbacks.append(PeriodicCheckpoint(args.save_freq, folder.path, args.save_replay_buffer))
+    if training.eval_env is not None:
+        callbacks.append(
+            MultiAgentEvalCallback(
+                training.eval_env,
+                args.eval_freq,
+                args.eval_episodes,
+                log_path=folder.path,
+                best_model_save_path=folder.path,
+                verbose=args.verbose,
+            )
+        )
+    return callbacks
+
+
+def start_logs(training: Training, folder: RunFolder) -> None:
+    """Open the run's logs: the monitor file, TensorBoard, the screen."""
+    env: Any = training.model.get_env()
+    while not isinstance(env, VecMonitor):
+        env = env.venv
+    env.info_keywords = metric_names_of(env)
+    env.results_writer = ResultsWriter(
+        str(folder.monitor_file), {"t_start": env.t_start, "env_id": folder.env_id}, env.info_keywords
+    )
+    args = training.args
+    log_path = folder.path
+    if args.tensorboard_log:
+        log_path = Path(args.tensorboard_log) / file_name(args.env) / f"{args.algo}_{folder.number}"
+    formats = ["stdout"] if args.verbose > 0 else []
+    formats += ["tensorboard"] if args.tensorboard_log != "" else []
+    training.model.set_logger(configure(str(log_path), formats))
+
+
+def log_interval(args: argparse.Namespace, n_envs: int) -> int | None:
+    """Episodes between log entries; ``None`` for none."""
+    if args.log_interval == -2:
+        return None
+    return args.log_interval if args.log_interval > 0 else EPISODES_PER_LOG * n_envs
+
+
+def train(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseCallback] = ()) -> int:
+    """
+    Train, and save the model whether the training ended or was stopped.
+
+    :param training: what was built
+    :param folder: where everything goes
+    :param extra_callbacks: beside those of the command line
+    :return: exit status
+    """
+    args, model = training.args, training.model
+    start_logs(training, folder)
+    with StopOnSignal() as stop:
+        try:
+            model.learn(
+                training.n_timesteps,
+                [*make_callbacks(training, folder), *extra_callbacks, stop],
+                log_interval(args, training.hyperparams.n_envs),  # type: ignore[arg-type]
+                reset_num_timesteps=not args.trained_agent,
+                progress_bar=args.progress,
+            )
+        except KeyboardInterrupt:
+            stop.received = stop.received or StopOnSignal.SIGNALS[0]
+    save_model(model, folder.last_model)
+    if args.save_replay_buffer or stop.received:
+        model.save_replay_buffer(folder.replay_buffer)
+    if stop.received is None:
+        print(f"trained {model.num_timesteps:,} env steps; the model is {folder.last_model}")
+        return 0
+    print(f"stopped after {model.num_timesteps:,} env steps; to go on: {continuing_command(args, folder)}")
+    return SIGNALLED + stop.received
+
+
+def continuing_command(args: argparse.Namespace, folder: RunFolder) -> str:
+    """The command that continues a stopped run to the end that it had planned."""
+    parser = make_parser()
+    words = ["python", "zoo/train.py", "--algo", args.algo, "--env", args.env, "-i", str(folder.last_model)]
+    for name in CARRIED_FLAGS:
+        value = getattr(args, name)
+        if value != parser.get_default(name):
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    if args.eval_env_kwargs:
+        words += ["--eval-env-kwargs", *args.eval_env_kwargs]
+    words += ["--save-replay-buffer"] * args.save_replay_buffer + ["-P"] * args.progress
+    return shlex.join(words)
+
+
+def main(argv: Sequence[str] | None = None, extra_callbacks: Sequence[BaseCallback] = ()) -> int:
+    """
+    The command.
+
+    :param argv: the command line; by default that of the process
+    :param extra_callbacks: for whoever starts a run from Python
+    :return: exit status
+    """
+    try:
+        args = make_parser().parse_all(argv)
+        training = build(args)
+    except (ValueError, gym.error.Error) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    folder = RunFolder.create(args.log_folder, args.algo, args.env)
+    words = ["python", "zoo/train.py", *(sys.argv[1:] if argv is None else argv)]
+    folder.describe(training.hyperparams.to_dict(), vars(args), shlex.join(words))
+    print(f"{args.algo} on {args.env}, seed {args.seed}, in {folder.path}")
+    if args.verbose > 0:
+        print(yaml.safe_dump(training.hyperparams.to_dict(), sort_keys=False))
+    return train(training, folder, extra_callbacks)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
