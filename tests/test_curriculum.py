@@ -40,7 +40,8 @@ class Student:
 
 def make_buffer(size=60, n_envs=1, n_agents=1, filled=True, **kwargs):
     """A buffer whose next draw refreshes it."""
-    kwargs = {"n_folds": 3, "teacher_batch_size": 8, "teacher_steps": 2, "first_teacher_steps": 2, "seed": 0, **kwargs}
+    few = {"teacher_batch_size": 8, "teacher_steps": 2, "first_teacher_steps": 2, "scored_per_update": 10**9}
+    kwargs = {"n_folds": 3, "seed": 0, **few, **kwargs}
     buffer = KFCVReplayBuffer(size, OBS, ACT, device="cpu", n_envs=n_envs, n_agents=n_agents, **kwargs)
     th.manual_seed(0)
     buffer.attach(Student(n_agents))
@@ -443,19 +444,21 @@ def test_refreshes_come_every_so_many_updates():
     assert [updates_until_refresh(buffer) for _ in range(3)] == [1, 12, 12]
 
 
-def test_a_quarter_of_new_transitions_refreshes_sooner():
-    """Not before a quarter of the interval, though: 40 / 4 = 10 updates."""
+@pytest.mark.parametrize(("n_new", "updates"), [(14, 40), (15, 1)])
+def test_a_quarter_of_new_transitions_refreshes_sooner(n_new, updates):
+    """A quarter of 60 is 15."""
     buffer = make_buffer(size=60, refresh_every=40, refresh_fraction=0.25)
     updates_until_refresh(buffer)
-    add(buffer, 15)
+    add(buffer, n_new)
+    assert updates_until_refresh(buffer) == updates
+
+
+def test_refreshes_keep_to_their_budget_of_scored_transitions():
+    """60 transitions at 6 per update: not before 10 updates, though all are new and a refresh is wanted at each update."""
+    buffer = make_buffer(size=60, refresh_every=1, scored_per_update=6)
+    updates_until_refresh(buffer)
+    add(buffer, 60)
     assert updates_until_refresh(buffer) == 10
-
-
-def test_fewer_new_transitions_do_not():
-    buffer = make_buffer(size=60, refresh_every=40, refresh_fraction=0.25)
-    updates_until_refresh(buffer)
-    add(buffer, 14)
-    assert updates_until_refresh(buffer) == 40
 
 
 def test_a_refresh_scores_what_is_new():
@@ -468,19 +471,21 @@ def test_a_refresh_scores_what_is_new():
 
 
 def test_the_first_refresh_takes_more_steps():
-    steps = []
+    """Each teacher sees one minibatch of 8 per step: 7 steps, then 3, then 3."""
     buffer = make_buffer(refresh_every=1, first_teacher_steps=7, teacher_steps=3)
-    fit = buffer.teachers.fit
-    buffer.teachers.fit = lambda rows, read, n, *args: steps.append(n) or fit(rows, read, n, *args)
+    trained = []
+    values = buffer.teachers.values
+    buffer.teachers.values = lambda inputs: (trained.append(inputs.shape[1]) if th.is_grad_enabled() else None, values(inputs))[1]
+    totals = []
     for _ in range(3):
         buffer.sample(4)
-    assert steps == [7, 3, 3]
+        totals.append(sum(trained))
+    assert totals == [7 * 8, 10 * 8, 13 * 8]
 
 
-@pytest.mark.parametrize("teacher_batch_size", [128])
-def test_a_buffer_smaller_than_a_teachers_minibatch_still_gets_its_curriculum(teacher_batch_size):
+def test_a_buffer_smaller_than_a_teachers_minibatch_still_gets_its_curriculum():
     """Full, it never grows any further: waiting for more would be waiting for ever."""
-    buffer = make_buffer(size=60, teacher_batch_size=teacher_batch_size)
+    buffer = make_buffer(size=60, teacher_batch_size=128)
     buffer.sample(4)
     assert buffer.n_refreshes == 1
 

@@ -192,7 +192,7 @@ class HardSpreadWorlds(ParticleWorlds):
             pieces.append(Rectangle(x - half, door_y + self.door / 2, x + half, HALF_SIZE, PALETTE["wall"]))
         covered = int(self._own.totals[world, COVERED_LAST])
         caption = f"step {self.steps[world]}/{self.max_steps}  covered {covered}/{self.n_agents}"
-        return Scene(HALF_SIZE, landmarks + agents, pieces, caption)
+        return Scene(HALF_SIZE, agents + landmarks, pieces, caption)  # a covered landmark shows on its agent
 
 
 def _listed_walls(
