@@ -1,5 +1,7 @@
 """Slow and plain versions of what the library does in stacks, and made-up transitions to feed both."""
 
+from itertools import pairwise
+
 import numpy as np
 import torch as th
 from torch import nn
@@ -8,7 +10,7 @@ from torch import nn
 def plain_mlp(sizes):
     """``nn.Linear`` layers with ReLU between them."""
     layers = []
-    for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
+    for n_in, n_out in pairwise(sizes):
         layers += [nn.Linear(n_in, n_out), nn.ReLU()]
     return nn.Sequential(*layers[:-1])
 

@@ -317,7 +317,8 @@ N = 600
 
 def scored_buffer(progress=0.0, **kwargs):
     """600 scored transitions: buckets of 200. Refreshed once, and not again."""
-    kwargs = {"score": "student", "refresh_every": 10**6, "lambda_init": 0.0, "curriculum_fraction": 0.5, **kwargs}
+    once = {"refresh_every": 10**6, "refresh_fraction": 10.0}
+    kwargs = {"score": "student", "lambda_init": 0.0, "curriculum_fraction": 0.5, **once, **kwargs}
     buffer = make_buffer(size=N, **kwargs)
     buffer.sample(1)
     assert buffer.n_refreshes == 1
@@ -475,7 +476,12 @@ def test_the_first_refresh_takes_more_steps():
     buffer = make_buffer(refresh_every=1, first_teacher_steps=7, teacher_steps=3)
     trained = []
     values = buffer.teachers.values
-    buffer.teachers.values = lambda inputs: (trained.append(inputs.shape[1]) if th.is_grad_enabled() else None, values(inputs))[1]
+
+    def counted(inputs):
+        trained.append(inputs.shape[1] if th.is_grad_enabled() else 0)
+        return values(inputs)
+
+    buffer.teachers.values = counted
     totals = []
     for _ in range(3):
         buffer.sample(4)
@@ -543,7 +549,9 @@ def test_settings_out_of_range_are_refused_by_name(kwargs, message):
         make_buffer(**kwargs)
 
 
-@pytest.mark.parametrize("kwargs", [{"n_folds": 2.5}, {"teacher_steps": 0}, {"first_teacher_steps": 0}, {"teacher_batch_size": 0}])
+@pytest.mark.parametrize(
+    "kwargs", [{"n_folds": 2.5}, {"teacher_steps": 0}, {"first_teacher_steps": 0}, {"teacher_batch_size": 0}]
+)
 def test_counts_that_are_no_counts_are_refused_by_name(kwargs):
     """Before any time is spent: when the buffer is made."""
     (name,) = kwargs

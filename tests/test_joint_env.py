@@ -205,9 +205,7 @@ def test_group_returns_start_anew_in_each_episode():
     assert results[1][3]["return_tank"] == 9.0
 
 
-@pytest.mark.parametrize(
-    ("reward", "first"), [("default", 2.0), ("mean", 2.0), ("sum", 6.0), ("scout", 1.5), ("tank", 3.0)]
-)
+@pytest.mark.parametrize(("reward", "first"), [("default", 2.0), ("mean", 2.0), ("sum", 6.0), ("scout", 1.5), ("tank", 3.0)])
 def test_the_scalar_reward_can_be_chosen(reward, first):
     """The first step's rewards are 1, 2 and 3."""
     env = JointEnv(ToyParallelEnv(), reward=reward)
@@ -417,9 +415,7 @@ def test_time_limit_of_the_compiled_worlds_is_stored_as_no_end():
 
 
 def test_deaths_are_stored_per_agent():
-    model = MADDPG(
-        "MlpPolicy", joint(deaths={"scout_1": 2}, time_limit=4), learning_starts=100, batch_size=8
-    ).learn(4)
+    model = MADDPG("MlpPolicy", joint(deaths={"scout_1": 2}, time_limit=4), learning_starts=100, batch_size=8).learn(4)
     assert model.replay_buffer.dones[:4, 0].tolist() == [[0, 0, 0], [0, 1, 0], [0, 1, 0], [0, 1, 0]]
     assert model.replay_buffer.alive[:4, 0].tolist() == [[1, 1, 1], [1, 1, 1], [1, 0, 1], [1, 0, 1]]
     assert model.replay_buffer.rewards[:4, 0].tolist() == [[1, 2, 3], [2, 4, 6], [3, 0, 9], [4, 0, 12]]

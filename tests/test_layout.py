@@ -71,6 +71,4 @@ def test_an_image_observation_is_refused_by_the_agents_name():
 
 def test_mixed_action_kinds_are_refused():
     with pytest.raises(ValueError, match="one kind for all"):
-        AgentLayout.from_spaces(
-            ["a_0", "b_0"], {"a_0": box(2), "b_0": box(2)}, {"a_0": box(1), "b_0": spaces.Discrete(2)}
-        )
+        AgentLayout.from_spaces(["a_0", "b_0"], {"a_0": box(2), "b_0": box(2)}, {"a_0": box(1), "b_0": spaces.Discrete(2)})

@@ -53,28 +53,31 @@ class SlowMADDPG:
     def __init__(self, model):
         self.model, self.layout = model, model.layout
         self.n_updates = 0
-        n, n_critics = self.layout.n_agents, len(model.critic.stacks)
-        agents = range(n)
+        n_critics = len(model.critic.stacks)
+        self.agents = model.agents  # those that learn; the others stand still
         self.nets = {
-            "actor": [model.actor.network(i) for i in agents],
-            "actor_target": [model.actor_target.network(i) for i in agents],
-            "critic": [[model.critic.network(i, c) for c in range(n_critics)] for i in agents],
-            "critic_target": [[model.critic_target.network(i, c) for c in range(n_critics)] for i in agents],
+            "actor": {v: model.actor.network(v) for v in self.agents},
+            "actor_target": {v: model.actor_target.network(v) for v in self.agents},
+            "critic": {v: self.critics_in(model.critic, v, n_critics) for v in self.agents},
+            "critic_target": {v: self.critics_in(model.critic_target, v, n_critics) for v in self.agents},
         }
         dtype = next(model.policy.parameters()).dtype
         for net in self.all_nets():
             net.to(dtype)
         lr = model.lr_schedule(1)
-        self.actor_adams = [th.optim.Adam(net.parameters(), lr=lr) for net in self.nets["actor"]]
-        self.critic_adams = [
-            th.optim.Adam([p for net in nets for p in net.parameters()], lr=lr) for nets in self.nets["critic"]
-        ]
+        self.actor_adams = {v: th.optim.Adam(net.parameters(), lr=lr) for v, net in self.nets["actor"].items()}
+        self.critic_adams = {
+            v: th.optim.Adam([p for net in nets for p in net.parameters()], lr=lr) for v, nets in self.nets["critic"].items()
+        }
+
+    def critics_in(self, critics, agent, n_critics):
+        return [critics.network(self.agents.index(agent), c) for c in range(n_critics)]
 
     def all_nets(self):
         for kind in ("actor", "actor_target"):
-            yield from self.nets[kind]
+            yield from self.nets[kind].values()
         for kind in ("critic", "critic_target"):
-            for nets in self.nets[kind]:
+            for nets in self.nets[kind].values():
                 yield from nets
 
     def encode(self, actions):
@@ -85,6 +88,8 @@ class SlowMADDPG:
         )
 
     def best_action(self, kind, agent, observations):
+        if agent not in self.agents:
+            return observations.new_zeros(len(observations), self.layout.action_sizes[agent])
         output = self.nets[kind][agent](observations[:, self.layout.obs_slices[agent]])
         if self.layout.discrete:
             return F.one_hot(output.argmax(-1), output.shape[-1]).to(output.dtype)
@@ -104,7 +109,7 @@ class SlowMADDPG:
         actions = self.without_the_dead(self.encode(batch.actions), batch.alive)
         # Before anything moves: the learner draws the discrete actors' Gumbel noise for all agents of a shape at once.
         noise = self.gumbel_noise(batch) if layout.discrete and self.n_updates % model.policy_delay == 0 else None
-        for v in range(layout.n_agents):
+        for v in self.agents:
             alive, gone = batch.alive[:, v], batch.dones[:, v]
             n_alive = alive.sum().clamp(min=1)
             with th.no_grad():
@@ -159,19 +164,20 @@ class SlowMADDPG:
     def move_targets(self):
         tau = self.model.tau
         for kind in ("actor", "critic"):
-            for nets, targets in zip(self.nets[kind], self.nets[f"{kind}_target"], strict=True):
-                pairs = zip(nets, targets, strict=True) if kind == "critic" else [(nets, targets)]
-                for net, target in pairs:
+            for v in self.agents:
+                nets, targets = self.nets[kind][v], self.nets[f"{kind}_target"][v]
+                for net, target in zip(nets, targets, strict=True) if kind == "critic" else [(nets, targets)]:
                     for p, q in zip(net.parameters(), target.parameters(), strict=True):
                         q.copy_(tau * p + (1 - tau) * q)
 
     def assert_equal_to(self, model, atol):
-        for v in range(self.layout.n_agents):
+        for v in self.agents:
             for kind in ("actor", "actor_target"):
                 assert_same_network(getattr(model, kind).network(v), self.nets[kind][v], atol, f"{kind} {v}")
             for kind in ("critic", "critic_target"):
-                for c, net in enumerate(self.nets[kind][v]):
-                    assert_same_network(getattr(model, kind).network(v, c), net, atol, f"{kind} {v} ({c})")
+                nets = self.critics_in(getattr(model, kind), v, len(self.nets[kind][v]))
+                for ours, theirs in zip(nets, self.nets[kind][v], strict=True):
+                    assert_same_network(ours, theirs, atol, f"{kind} {v}")
 
 
 def assert_same_network(ours, theirs, atol, name):
@@ -179,8 +185,17 @@ def assert_same_network(ours, theirs, atol, name):
         th.testing.assert_close(one.to(other.dtype), other, atol=atol, rtol=0, msg=lambda text: f"{name}: {text}")
 
 
+class Still:
+    """An opponent that never moves."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return np.zeros((len(observation), 5), np.float32), None
+
+
 VARIANTS = {
     "defaults": {},
+    "a team of two": {"team": "scout", "opponents": {"tank": Still()}},
+    "a team of the last": {"team": "tank", "opponents": {"scout": Still()}, "critic_input": "state"},
     "twin critics, delayed actors": {"policy_delay": 2, "policy_kwargs": {"net_arch": [8, 7], "n_critics": 2}},
     "clipped gradients": {"max_grad_norm": 0.05},
     "critics of the state": {"critic_input": "state"},
@@ -236,7 +251,10 @@ def test_importance_weights_scale_the_critic_loss_alone():
 
 @pytest.mark.parametrize("max_grad_norm", [None, 0.05])
 def test_shared_parameters_equal_one_network_per_group_with_one_hot_agents(max_grad_norm):
-    """Two scouts share an actor and a critic, whose loss is the sum of theirs; the tank has its own."""
+    """
+    Two scouts share an actor and a critic, whose loss is the sum of theirs; the tank has its own. The shared critic reads
+    the agent itself first: for the second scout the two scouts change places.
+    """
     model = make_model(share_parameters=True, max_grad_norm=max_grad_norm)
     (batch,) = draw(model, 1)
     layout = model.layout
@@ -256,7 +274,11 @@ def test_shared_parameters_equal_one_network_per_group_with_one_hot_agents(max_g
                 nn.utils.clip_grad_norm_(net.parameters(), max_grad_norm)
         adam.step()
 
+    # Joint input: observations of the scouts 0–2, 3–5 and the tank 6–7; actions of the scouts 8–9, 10–11 and the tank 12
+    swapped = [3, 4, 5, 0, 1, 2, 6, 7, 10, 11, 8, 9, 12]
+
     def q_value(v, inputs):
+        inputs = inputs[:, swapped] if v == 1 else inputs
         return critics[group_of_agent[v]](with_one_hot(inputs, v, 3)).squeeze(1)
 
     def mean_alive(values, v):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from references import one_hot_networks, plain_mlp, with_one_hot
+from references import one_hot_networks, with_one_hot
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.td3.policies import Actor, ContinuousCritic
 from torch import nn
@@ -296,3 +296,21 @@ def test_each_actor_reads_its_own_observation_alone(layout):
         if not th.equal(one, other)
     }
     assert moved == {1}
+
+
+@pytest.mark.parametrize("state_size", [0, 5, 9], ids=["no state", "a state", "a state as long as all observations"])
+def test_a_shared_critic_reads_the_agent_itself_first(state_size):
+    """
+    Three agents, one critic, told apart by nothing: agent 1 sees (1, 2, 0) as agent 0 sees (0, 1, 2). The critic reads
+    the observations, whatever the length of the world's state.
+    """
+    layout = AgentLayout(("a_0", "a_1", "a_2"), ("a",) * 3, (3, 3, 3), (2, 2, 2), state_size=state_size)
+    critics = critics_of(layout, share_parameters=True)
+    nn.init.zeros_(critics.stacks[0].member_bias)
+    observations, actions = th.randn(4, 3, 3), th.randn(4, 3, 2)  # (batch, agents, size)
+
+    def q_values(order):
+        return critics(th.cat([observations[:, order].flatten(1), actions[:, order].flatten(1)], dim=1))[0]
+
+    close(q_values([0, 1, 2])[1], q_values([1, 2, 0])[0])
+    close(q_values([0, 1, 2])[2], q_values([2, 0, 1])[0])

@@ -27,9 +27,7 @@ class ToyParallelEnv(ParallelEnv):
     metadata = {"name": "toy_v0", "render_modes": []}  # noqa: RUF012
     render_mode = None
 
-    def __init__(
-        self, agents=tuple(OBS_SIZES), time_limit=None, deaths=None, end=None, discrete=False, with_state=True
-    ):
+    def __init__(self, agents=tuple(OBS_SIZES), time_limit=None, deaths=None, end=None, discrete=False, with_state=True):
         self.possible_agents = list(agents)
         self.agents = []
         self.time_limit, self.deaths, self.end, self.discrete = time_limit, deaths or {}, end, discrete

@@ -128,7 +128,9 @@ def plot_learning_curve(measured: Mapping[str, np.ndarray], env: VecEnv, path: P
     figure, axes = new_figure(2, "Grassland: learned players against scripted ones (mean and 95 % interval over episodes)")
     for axis, group in zip(axes, YARDSTICKS, strict=True):
         (rival,) = YARDSTICKS[group].values()
-        draw_curve(axis, measured["timesteps"], measured[f"return_{group}"], ALGO_COLOURS[ALGO], f"{ALGO_LABELS[ALGO]} {group}")
+        draw_curve(
+            axis, measured["timesteps"], measured[f"return_{group}"], ALGO_COLOURS[ALGO], f"{ALGO_LABELS[ALGO]} {group}"
+        )
         scripted = {
             f"scripted: {name}": float(evaluate(yardstick(group, name, layout_of(env)), env, 256)[f"return_{group}"].mean())
             for name in REFERENCES[group]
@@ -179,7 +181,9 @@ def verdict(results: Mapping[tuple[str, str], Mapping[str, np.ndarray]]) -> str:
             # Both played in the same worlds, so episodes pair up.
             difference = with_interval(returns("trained") - returns(script))
             word = "more than" if difference.low > 0 else "less than" if difference.high < 0 else "not clearly different from"
-            comparisons.append(f"{word} {script!r} ({difference.mean:+.2f}, 95 % {difference.low:+.2f} … {difference.high:+.2f})")
+            comparisons.append(
+                f"{word} {script!r} ({difference.mean:+.2f}, 95 % {difference.low:+.2f} … {difference.high:+.2f})"
+            )
         sentences.append(f"Against {rival!r} a trained {group} gets " + "; ".join(comparisons) + ".")
     return "\n".join(sentences)
 
@@ -222,7 +226,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     save_arrays(folder / "learning_curve.npz", measure.arrays())
     plot_learning_curve(measure.arrays(), env, folder / "learning_curve.png")
     table, results = match_table(training.model, args.episodes, args.seed + TABLE_SEED)
-    print(f"\nAll line-ups, {args.episodes} episodes each in the same fresh worlds (± is the 95 % interval of the mean):\n\n{table}")
+    print(f"\nAll line-ups, {args.episodes} episodes each in the same fresh worlds (±: 95 % interval of the mean):\n\n{table}")
     print(f"\n{verdict(results)}")
     gif_env = make_vec_env(WORLD, 1, args.seed + GIF_SEED, {"render_mode": "rgb_array"})
     save_gif(record(training.model, gif_env, 4), folder / "grassland.gif", fps=8)

@@ -87,7 +87,9 @@ def make_parser() -> Parser:
     add("-f", "--log-folder", default="logs", help="where run folders are made (default: %(default)s)")
     add("-tb", "--tensorboard-log", help='TensorBoard folder (default: the run folder); "" turns it off')
     add("-P", "--progress", action="store_true", help="show a progress bar with the time left")
-    add("--eval-freq", type=whole_number, default=25_000, help="env steps between evaluations, -1: none (default: %(default)s)")
+    add(
+        "--eval-freq", type=whole_number, default=25_000, help="env steps between evaluations, -1: none (default: %(default)s)"
+    )
     add("--eval-episodes", type=int, default=20, help="episodes per evaluation (default: %(default)s)")
     add("--n-eval-envs", type=int, default=20, help="worlds that evaluate side by side (default: %(default)s)")
     add("--save-freq", type=whole_number, default=-1, help="env steps between checkpoints, -1: none (default: %(default)s)")

@@ -117,7 +117,14 @@ def describe(hint: Any) -> str:
     if origin in (typing.Union, types.UnionType):
         parts = dict.fromkeys(describe(argument) for argument in arguments)
         return " or ".join(part for part in parts if part)
-    plain = {int: "a whole number", float: "a number", bool: "true or false", str: "text", types.NoneType: "null", dict: "a map"}
+    plain = {
+        int: "a whole number",
+        float: "a number",
+        bool: "true or false",
+        str: "text",
+        types.NoneType: "null",
+        dict: "a map",
+    }
     if origin in plain:
         return plain[origin]
     if origin is type:

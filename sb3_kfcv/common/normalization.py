@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -27,12 +28,13 @@ def save_model(model: BaseAlgorithm, path: str | Path) -> None:
     model.save(path)
     env = model.get_vec_normalize_env()
     if env is not None:
+        statistics: Any = env.obs_rms
         with atomic_write(normalization_file(path)) as file:
             np.savez(
                 file,
-                mean=env.obs_rms.mean,
-                var=env.obs_rms.var,
-                count=env.obs_rms.count,
+                mean=statistics.mean,
+                var=statistics.var,
+                count=statistics.count,
                 clip_obs=env.clip_obs,
                 epsilon=env.epsilon,
             )
@@ -60,6 +62,6 @@ def load_normalization(model_path: str | Path, env: VecEnv, training: bool) -> V
         )
         if saved["mean"].shape != env.observation_space.shape:
             raise ValueError(f"{path} is for observations {saved['mean'].shape}; the env has {env.observation_space.shape}")
-        statistics = normalized.obs_rms
+        statistics: Any = normalized.obs_rms
         statistics.mean, statistics.var, statistics.count = saved["mean"], saved["var"], float(saved["count"])
     return normalized

@@ -9,17 +9,36 @@ of a body is 1. Three things are ours, since the original leaves them undefined 
 - a centre stays inside the plane (:func:`clip_to_plane`);
 - a centre stops at the middle line of a wall (:func:`stop_at_mid_line`). The contact law alone stops one agent at
   top speed at walls of width 0.2 or more, but not an agent that others push.
-
-numba's disk cache looks at the file of the compiled function only, not at what it calls: after a change of this file,
-delete ``sb3_kfcv/envs/__pycache__`` or touch the modules of the worlds.
 """
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 from numba import njit
+
+
+def drop_stale_cache(source: Path = Path(__file__)) -> None:
+    """
+    Delete compiled code that is older than this file.
+
+    numba's disk cache looks at the file of a compiled function alone, not at the files of what it calls, so that the
+    worlds would go on with the physics that they were compiled with.
+
+    :param source: the file that all compiled code beside it depends on
+    """
+    changed = source.stat().st_mtime
+    for compiled in (source.parent / "__pycache__").glob("*.nb[ci]"):
+        try:
+            if compiled.stat().st_mtime < changed:
+                compiled.unlink(missing_ok=True)
+        except OSError:  # another process was faster, or the folder is read-only
+            continue
+
+
+drop_stale_cache()
 
 DT = 0.1
 """Time of one step."""

@@ -220,6 +220,8 @@ class MADDPG(OffPolicyAlgorithm):
             raise ValueError(f"batch_size={self.batch_size} is larger than buffer_size={self.buffer_size}")
         if self.opponents and not self.team:
             raise ValueError("opponents are for a model that learns one group; say which with team=")
+        if self._vec_normalize_env is not None and self._vec_normalize_env.norm_reward:
+            raise ValueError("norm_reward=True cannot reach the per-agent rewards; use VecNormalize(env, norm_reward=False)")
         if self.team and self._vec_normalize_env is not None:
             raise ValueError("team= does not work under VecNormalize: the opponents need the observations as they are")
 
