@@ -185,8 +185,8 @@ def layout(request):
 
 
 def critics_of(layout, agents=None, **kwargs):
-    size = sum(layout.obs_sizes) + sum(layout.action_sizes)
-    return StackedCritics(layout, range(layout.n_agents) if agents is None else agents, size, [8, 6], **kwargs)
+    agents = range(layout.n_agents) if agents is None else agents
+    return StackedCritics(layout, agents, "observations", [8, 6], **kwargs)
 
 
 def in_blocks(critics, per_agent):

@@ -35,7 +35,7 @@ GIVEN_TO_BUFFER = (
     *("n_agents", "state_size", "seed"),
 )
 GIVEN_TO_POLICY = (
-    *("self", "observation_space", "action_space", "lr_schedule", "layout", "agents", "critic_input_size"),
+    *("self", "observation_space", "action_space", "lr_schedule", "layout", "agents", "critic_input"),
     "share_parameters",
 )
 OF_THE_RUN = {

@@ -149,7 +149,7 @@ class StackedMLP(nn.Module):
 
     def gradient_norms(self) -> th.Tensor:
         """Euclidean norm of each network's gradient: (networks,)."""
-        squares = th.zeros(self.n_networks, device=self.first.weight.device)
+        squares = self.first.weight.new_zeros(self.n_networks)
         for layer in [self.first, *self.rest]:
             for parameter in (layer.weight, layer.bias):
                 squares += self._network_view(parameter.grad, layer).square().sum((1, 3)).flatten()

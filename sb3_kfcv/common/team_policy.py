@@ -52,6 +52,9 @@ class TeamPolicy:
         wanted = layout.group_names if groups is None else tuple(groups)
         if set(players) != set(wanted):
             raise ValueError(f"players were given for {sorted(players)}; to be played are {sorted(wanted)}")
+        for group, player in players.items():
+            if getattr(player, "layout", layout) != layout:
+                raise ValueError(f"the player of {group!r} is for another world: {player.layout}")  # type: ignore[union-attr]
         self.layout = layout
         self.players: dict[str, ScriptedPolicy | JointModel] = {
             group: scripted_policy(player, layout, group, rng, **facts) if isinstance(player, str) else player

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch as th
 from gymnasium import spaces
 from scipy.stats import spearmanr
 
+from sb3_kfcv.common.checks import require_between, require_count
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.curriculum.difficulty import buckets_by_difficulty, combine_agents, cross_validated_errors
 from sb3_kfcv.curriculum.folds import assign_folds, rows_per_fold
@@ -40,7 +42,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
 
     :param n_folds: K: folds, teachers per agent, buckets and stages
     :param refresh_every: updates between refreshes (Algorithm 1 as printed refreshes at every step, at many times the cost)
-    :param refresh_fraction: refresh sooner when this share of the transitions is new
+    :param refresh_fraction: refresh sooner when this share of the transitions is new (beyond 1: never sooner)
     :param scored_per_update: bound of the cost: refreshes are spaced so that at most this many transitions are scored
         per update, whatever the size of the buffer and the number of worlds that fill it
     :param teacher_steps: gradient steps of the teachers per refresh
@@ -86,15 +88,22 @@ class KFCVReplayBuffer(JointReplayBuffer):
             buffer_size, observation_space, action_space, device, n_envs, optimize_memory_usage, n_agents, state_size, seed
         )
         n_rows = self.buffer_size * n_envs
+        require_count("n_folds", n_folds, least=2)
         if not 2 <= n_folds <= n_rows:
             raise ValueError(f"n_folds must lie between 2 and the buffer's {n_rows} transitions, got {n_folds}")
         if stage_rule not in STAGE_RULES:
             raise ValueError(unknown_name("stage_rule", stage_rule, STAGE_RULES))
         if score not in SCORES:
             raise ValueError(unknown_name("score", score, SCORES))
-        for name, value in (("lambda_init", lambda_init), ("curriculum_fraction", curriculum_fraction)):
-            if not 0 <= value <= 1:
-                raise ValueError(f"{name} must lie in [0, 1], got {value}")
+        for name, count in (("refresh_every", refresh_every), ("scored_per_update", scored_per_update)):
+            require_count(name, count)
+        for name, count in (("teacher_steps", teacher_steps), ("first_teacher_steps", first_teacher_steps)):
+            require_count(name, count)
+        require_count("teacher_batch_size", teacher_batch_size)
+        for name, share in (("lambda_init", lambda_init), ("curriculum_fraction", curriculum_fraction)):
+            require_between(name, share, 0, 1)
+        require_between("refresh_fraction", refresh_fraction, 0, above=True)
+        require_between("teacher_learning_rate", teacher_learning_rate, 0)
         self.n_folds = n_folds
         self.refresh_every, self.refresh_fraction, self.scored_per_update = refresh_every, refresh_fraction, scored_per_update
         self.teacher_steps, self.first_teacher_steps = teacher_steps, first_teacher_steps
@@ -110,6 +119,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
         self._updates_since_refresh = 0
         self._new_since_refresh = 0
         self.n_refreshes = 0
+        self._warned = False
         self._stats: dict[str, Any] = {}
         self._refresh_seconds = 0.0
 
@@ -151,6 +161,9 @@ class KFCVReplayBuffer(JointReplayBuffer):
             self._updates_since_refresh += 1
             if self._refresh_is_due():
                 self.refresh()
+        elif self.n_refreshes == 0 and not self._warned:
+            warnings.warn("the curriculum's share of training was over before learning began: all replay is uniform")
+            self._warned = True
         return self.curriculum_rows(batch_size), None
 
     def curriculum_rows(self, batch_size: int) -> np.ndarray:
@@ -184,7 +197,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
     def _refresh_is_due(self) -> bool:
         n, waited = self.n_rows, self._updates_since_refresh
         if self.n_refreshes == 0:
-            return n >= max(self.n_folds, self.teacher_batch_size)
+            return n >= self.n_folds
         many_new = self._new_since_refresh >= self.refresh_fraction * n
         return waited * self.scored_per_update >= n and (many_new or waited >= self.refresh_every)
 
@@ -222,7 +235,9 @@ class KFCVReplayBuffer(JointReplayBuffer):
     def _teacher_scores(self, inputs: th.Tensor, targets: th.Tensor, live: th.Tensor) -> np.ndarray:
         """Train the teachers on their folds, and score every row by those that have not seen it (eq. 9–11): (n,)."""
         # Targets in units of their own spread: eq. 9 has the same minimum, and few steps come near it.
-        targets = (targets - targets.mean(1, keepdim=True)) / targets.std(1, keepdim=True).clamp(min=1e-6)
+        count = live.sum(1, keepdim=True).clamp(min=1)
+        targets = targets - (targets * live).sum(1, keepdim=True) / count
+        targets = targets / ((targets.square() * live).sum(1, keepdim=True) / count).sqrt().clamp(min=1e-6)
         folds = self.folds[: self.n_rows]
         steps = self.teacher_steps if self.n_refreshes else self.first_teacher_steps
         members = rows_per_fold(folds, self.n_folds)
@@ -274,7 +289,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
         return {**super().state_arrays(), **rows, "refresh_clock": np.array(clock), **teachers}
 
     def load_state_arrays(self, arrays: dict[str, np.ndarray]) -> None:
-        if "folds" in arrays and arrays["folds"].shape != self.folds.shape:
+        if "folds" in arrays and len(arrays["folds"]) != len(self.folds):
             raise ValueError(f"not a replay buffer of this model: {len(arrays['folds'])} rows, here {len(self.folds)}")
         super().load_state_arrays(arrays)
         self.folds, self.scores, self.buckets = (arrays[name].copy() for name in ("folds", "scores", "buckets"))
@@ -283,6 +298,9 @@ class KFCVReplayBuffer(JointReplayBuffer):
         self.teachers.load_state_dict(
             {name.removeprefix("teacher."): th.as_tensor(array) for name, array in arrays.items() if "teacher." in name}
         )
+
+    def _other_arrays(self) -> tuple[str, ...]:
+        return (*super()._other_arrays(), "folds", "scores", "buckets", "refresh_clock")
 
 
 def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:

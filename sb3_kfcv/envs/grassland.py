@@ -297,7 +297,7 @@ def _step(actions, common, own, n_wolves, phi, sheep_pays_each, max_steps):
         sheep_left = False
         for i in range(n):
             common.rewards[world, i] = rewards[i]
-            common.returns[world, i] += rewards[i]
+            common.returns[world, i] += common.rewards[world, i]
             if alive_before[i] and not alive[i]:
                 common.died_at[world, i] = common.steps[world]
                 velocities[i] = 0.0

@@ -375,7 +375,7 @@ def _step(actions, common, own, wall_width, door, phi, exclusive_cover, max_step
             cover_term = COVER_REWARD if covers[i] else 0.0
             reward = distance_term + collision_term + cover_term
             common.rewards[world, i] = reward
-            common.returns[world, i] += reward
+            common.returns[world, i] += common.rewards[world, i]
             totals[DISTANCE_TERM] += distance_term
             totals[COLLISION_TERM] += collision_term
             totals[COVER_TERM] += cover_term

@@ -3,6 +3,7 @@ from __future__ import annotations
 import io
 import pathlib
 import time
+import zipfile
 from collections import deque
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
@@ -17,8 +18,9 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import polyak_update, safe_mean
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
+from sb3_kfcv.common.checks import require_between, require_count
 from sb3_kfcv.common.files import atomic_write, with_suffix
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.team_policy import TeamPolicy
@@ -179,7 +181,6 @@ class MADDPG(OffPolicyAlgorithm):
         self._agent_of_column = [i for i, size in enumerate(layout.action_sizes) for _ in range(size)]
         self._opponent_policy = self._make_opponent_policy()
         state_size = layout.state_size if self.critic_input == "state" else 0
-        self.critic_input_size = (state_size or sum(layout.obs_sizes)) + sum(layout.action_sizes)
         if self.action_noise is None and not layout.discrete and self.exploration_noise > 0:
             size = sum(layout.action_sizes)
             self.action_noise = NormalActionNoise(np.zeros(size), np.full(size, self.exploration_noise), dtype=np.float32)
@@ -188,7 +189,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.policy_kwargs = {
             "layout": layout,
             "agents": self.agents,
-            "critic_input_size": self.critic_input_size,
+            "critic_input": self.critic_input,
             "share_parameters": self.share_parameters,
             **self.policy_kwargs,
         }
@@ -201,6 +202,7 @@ class MADDPG(OffPolicyAlgorithm):
         super()._setup_model()
         self.policy_kwargs, self.replay_buffer_kwargs = users_kwargs
         self._create_aliases()
+        self.critic_input_size = self.critic.input_size
         self._watch = Diagnostics(layout, self.agents)
         self._episode_metrics: deque[dict[str, float]] = deque(maxlen=self._stats_window_size)
         self.replay_buffer.attach(self)
@@ -213,9 +215,14 @@ class MADDPG(OffPolicyAlgorithm):
         if self.critic_input == "state" and not layout.state_size:
             raise ValueError('critic_input="state" needs a world that has a state(); this one has none')
         for name in ("buffer_size", "batch_size", "policy_delay"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < 1:
-                raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+            require_count(name, getattr(self, name))
+        require_between("gamma", self.gamma, 0, 1)
+        require_between("tau", self.tau, 0, 1)
+        for name in ("exploration_noise", "target_policy_noise", "target_noise_clip", "actor_regularization"):
+            require_between(name, getattr(self, name), 0)
+        require_between("gumbel_temperature", self.gumbel_temperature, 0, above=True)
+        if self.max_grad_norm is not None:
+            require_between("max_grad_norm", self.max_grad_norm, 0, above=True)
         if self.batch_size > self.buffer_size:
             raise ValueError(f"batch_size={self.batch_size} is larger than buffer_size={self.buffer_size}")
         if self.opponents and not self.team:
@@ -260,7 +267,8 @@ class MADDPG(OffPolicyAlgorithm):
             if self._n_updates % self.policy_delay == 0:
                 own_actions, raw = self.actor.relaxed(batch.observations, self.gumbel_temperature)
                 actor_losses = -live_mean(self.critic.with_own_actions(inputs, own_actions), live)  # (agents,)
-                penalty = self.actor_regularization * sum(output.square().mean((1, 2)).sum() for output in raw)
+                sizes = self.actor.by_agent([output.square().mean(-1) for output in raw])  # (agents, batch)
+                penalty = self.actor_regularization * live_mean(sizes, live).sum()
                 self._minimise(self.actor, actor_losses.sum() + penalty)
                 self._watch.actors(actor_losses, own_actions)
 
@@ -411,6 +419,21 @@ class MADDPG(OffPolicyAlgorithm):
             progress_bar=progress_bar,
         )
 
+    def set_env(self, env: Any, force_reset: bool = True) -> None:
+        """
+        Go on in another env, as in SB3.
+
+        :param env: whatever the constructor takes
+        :param force_reset: reset it before the next step
+        :raises ValueError: if its agents are not those that the model was made for
+        """
+        env = self._wrap_env(maybe_make_env(env, self.verbose), self.verbose)
+        if layout_of(env) != self.layout:
+            raise ValueError(f"the model is for {self.layout}; the env given has {layout_of(env)}")
+        super().set_env(env, force_reset)
+        self._vec_normalize_env = unwrap_vec_normalize(env)
+        self._check_settings()
+
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         return OffPolicyAlgorithm._wrap_env(wrap_env(env, monitor_wrapper), verbose, monitor_wrapper)
@@ -434,6 +457,8 @@ class MADDPG(OffPolicyAlgorithm):
             if "spaces do not match" not in str(error):
                 raise
             raise ValueError(f"the model in {path} was trained for another world than the env given: {error}") from None
+        except (AssertionError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path} is no model file, or it is damaged: {error}") from None
         if env is not None and layout_of(env) != model.layout:
             raise ValueError(f"the model in {path} is for {model.layout}; the env given has {layout_of(env)}")
         return model
@@ -478,8 +503,12 @@ class MADDPG(OffPolicyAlgorithm):
         :raises ValueError: if the file is of another buffer
         """
         source = with_suffix(path, ".npz") if isinstance(path, (str, pathlib.Path)) else path
-        with np.load(source, allow_pickle=False) as arrays:
-            self.replay_buffer.load_state_arrays(dict(arrays))
+        try:
+            with np.load(source, allow_pickle=False) as file:
+                arrays = dict(file)
+        except (EOFError, ValueError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path} is no replay buffer file, or it is damaged: {error}") from None
+        self.replay_buffer.load_state_arrays(arrays)
 
     def _excluded_save_params(self) -> list[str]:
         excluded = ["actor", "actor_target", "critic", "critic_target", "_watch", "_opponent_policy"]

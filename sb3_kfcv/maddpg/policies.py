@@ -14,19 +14,23 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.stacked_networks import StackedMLP
 
 
 class Block:
     """
-    Agents whose observations and actions have equal sizes, so that their actors stack.
+    Learning agents whose observations and actions have equal sizes, so that their actors stack.
 
+    :param layout: who sits where in the joint rows
     :param agents: indices of the agents in the layout
+    :param positions: their places among the learning agents
     """
 
-    def __init__(self, layout: AgentLayout, agents: Sequence[int]) -> None:
+    def __init__(self, layout: AgentLayout, agents: Sequence[int], positions: Sequence[int]) -> None:
         self.agents = list(agents)
+        self.positions = th.tensor(list(positions))
         self.obs_size = layout.obs_sizes[agents[0]]
         self.action_size = layout.action_sizes[agents[0]]
         self.obs_columns = _Columns([layout.obs_slices[i] for i in agents])
@@ -38,7 +42,7 @@ class Block:
         shapes: dict[tuple[int, int], list[int]] = {}
         for i in agents:
             shapes.setdefault((layout.obs_sizes[i], layout.action_sizes[i]), []).append(i)
-        return [Block(layout, members) for members in shapes.values()]
+        return [Block(layout, members, [list(agents).index(i) for i in members]) for members in shapes.values()]
 
 
 class _Columns:
@@ -127,6 +131,12 @@ class StackedActors(nn.Module):
             return [th.tanh(output) for output in outputs], outputs
         return [F.gumbel_softmax(logits, tau=temperature, hard=True) for logits in outputs], outputs
 
+    def by_agent(self, values: list[th.Tensor]) -> th.Tensor:
+        """Values per block, (agents of the block, …) each, in the order of the learning agents: (agents, …)."""
+        if len(values) == 1:
+            return values[0]
+        return th.cat(values)[th.cat([block.positions for block in self.blocks]).argsort()]
+
     def network(self, agent: int) -> nn.Sequential:
         """The network of one agent, as separate ``nn.Linear`` layers (a copy; its last layer is linear)."""
         for stack, block in zip(self.stacks, self.blocks, strict=True):
@@ -141,7 +151,7 @@ class StackedCritics(nn.Module):
 
     :param layout: who sits where in the joint rows
     :param agents: the learning agents
-    :param input_size: length of the input: all observations, or the world's state, and then the joint action
+    :param critic_input: ``"observations"`` (of all agents) or ``"state"`` (the world's); the joint action comes after it
     :param net_arch: hidden sizes
     :param activation_fn: activation between layers
     :param n_critics: critics per agent (2 for clipped double Q-learning)
@@ -154,20 +164,20 @@ class StackedCritics(nn.Module):
         self,
         layout: AgentLayout,
         agents: Sequence[int],
-        input_size: int,
+        critic_input: str,
         net_arch: list[int],
         activation_fn: type[nn.Module] = nn.ReLU,
         n_critics: int = 1,
         share_parameters: bool = False,
     ) -> None:
         super().__init__()
-        self.actions_start = input_size - sum(layout.action_sizes)
+        self.actions_start = layout.state_size if critic_input == "state" else sum(layout.obs_sizes)
+        self.input_size = self.actions_start + sum(layout.action_sizes)
         self.blocks = Block.split(layout, agents)
-        self.positions = [th.tensor([list(agents).index(i) for i in block.agents]) for block in self.blocks]
         members = shared_members(layout, agents) if share_parameters else None
         n_networks = max(members) + 1 if members else len(agents)
-        order = ego_order(layout, agents, input_size) if share_parameters else None
-        sizes = [input_size, *net_arch, 1]
+        order = ego_order(layout, agents, critic_input) if share_parameters else None
+        sizes = [self.input_size, *net_arch, 1]
         self.stacks = nn.ModuleList(
             StackedMLP(n_networks, sizes, activation_fn, n_inputs=1, members=members, input_order=order)
             for _ in range(n_critics)
@@ -195,12 +205,12 @@ class StackedCritics(nn.Module):
         with th.no_grad():
             z = stack.first_layer(inputs.unsqueeze(0))  # (agents, batch, hidden)
         moved = []
-        for block, positions, new in zip(self.blocks, self.positions, own_actions, strict=True):
+        for block, new in zip(self.blocks, own_actions, strict=True):
             old = block.action_columns.read(inputs[:, self.actions_start :])
-            own_columns = stack.input_columns(positions, self.actions_start + block.action_columns.index)
-            moved.append(th.baddbmm(z[positions] if len(self.blocks) > 1 else z, new - old, own_columns))
+            own_columns = stack.input_columns(block.positions, self.actions_start + block.action_columns.index)
+            moved.append(th.baddbmm(z[block.positions] if len(self.blocks) > 1 else z, new - old, own_columns))
         if len(self.blocks) > 1:
-            moved = [th.cat(moved)[th.cat(self.positions).argsort()]]
+            moved = [th.cat(moved)[th.cat([block.positions for block in self.blocks]).argsort()]]
         return stack.after_first_layer(moved[0], frozen=True).squeeze(-1)
 
     def network(self, position: int, critic: int = 0) -> nn.Sequential:
@@ -214,22 +224,22 @@ def shared_members(layout: AgentLayout, agents: Sequence[int]) -> list[int]:
     return [groups.index(layout.groups[i]) for i in agents]
 
 
-def ego_order(layout: AgentLayout, agents: Sequence[int], input_size: int) -> th.Tensor:
+def ego_order(layout: AgentLayout, agents: Sequence[int], critic_input: str) -> th.Tensor:
     """
     The order in which each agent's critic reads the joint input when a group shares one critic: the agent itself first,
     then the others of its group in turn; other groups, and a world state, as they are.
 
     :param layout: who sits where in the joint rows
     :param agents: the learning agents
-    :param input_size: length of the critics' input: all observations, or the world's state, and then the joint action
+    :param critic_input: ``"observations"`` or ``"state"``, what stands before the joint action
     :return: (agents, input) which input of the shared network takes each column
     :raises ValueError: if agents of a group have different spaces
     """
-    n_seen = input_size - sum(layout.action_sizes)
+    n_seen = layout.state_size if critic_input == "state" else sum(layout.obs_sizes)
     parts = [(n_seen, layout.action_slices)]
-    if n_seen == sum(layout.obs_sizes) != layout.state_size:
+    if critic_input == "observations":
         parts.append((0, layout.obs_slices))
-    order = th.arange(input_size).repeat(len(agents), 1)
+    order = th.arange(n_seen + sum(layout.action_sizes)).repeat(len(agents), 1)
     for row, agent in enumerate(agents):
         members = layout.members(layout.groups[agent])
         shapes = {(layout.obs_sizes[i], layout.action_sizes[i]) for i in members}
@@ -252,7 +262,7 @@ class MADDPGPolicy(BasePolicy):
     :param lr_schedule: learning rate of actors and critics
     :param layout: who sits where in the joint rows; set by the algorithm
     :param agents: the learning agents; set by the algorithm
-    :param critic_input_size: length of the critics' input; set by the algorithm
+    :param critic_input: ``"observations"`` or ``"state"``; set by the algorithm
     :param net_arch: hidden sizes of both kinds, or ``dict(pi=[…], qf=[…])``; Table 1: 64 (two layers, as MADDPG has)
     :param activation_fn: activation between layers
     :param n_critics: critics per agent
@@ -273,7 +283,7 @@ class MADDPGPolicy(BasePolicy):
         lr_schedule: Schedule,
         layout: AgentLayout,
         agents: Sequence[int],
-        critic_input_size: int,
+        critic_input: str = "observations",
         net_arch: list[int] | dict[str, list[int]] | None = None,
         activation_fn: type[nn.Module] = nn.ReLU,
         n_critics: int = 1,
@@ -281,6 +291,7 @@ class MADDPGPolicy(BasePolicy):
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
+        require_count("n_critics", n_critics)
         if optimizer_kwargs is None:
             optimizer_kwargs = {"fused": True} if optimizer_class is th.optim.Adam else {}
         super().__init__(
@@ -294,7 +305,7 @@ class MADDPGPolicy(BasePolicy):
         self._own_parameters = {
             "layout": layout,
             "agents": list(agents),
-            "critic_input_size": critic_input_size,
+            "critic_input": critic_input,
             "net_arch": net_arch,
             "activation_fn": activation_fn,
             "n_critics": n_critics,
@@ -308,7 +319,7 @@ class MADDPGPolicy(BasePolicy):
             return StackedActors(layout, agents, actor_arch, activation_fn, share_parameters)
 
         def make_critic() -> StackedCritics:
-            return StackedCritics(layout, agents, critic_input_size, critic_arch, activation_fn, n_critics, share_parameters)
+            return StackedCritics(layout, agents, critic_input, critic_arch, activation_fn, n_critics, share_parameters)
 
         self.actor, self.actor_target = make_actor(), make_actor()
         self.critic, self.critic_target = make_critic(), make_critic()
@@ -371,6 +382,9 @@ class MADDPGPolicy(BasePolicy):
         """
         index = self.layout.agents.index(agent)
         network = self.actor.network(index)
+        size = self.layout.obs_sizes[index]
+        if np.ndim(observation) not in (1, 2) or np.shape(observation)[-1] != size:
+            raise ValueError(f"an observation of {agent!r} has {size} values; got an array of shape {np.shape(observation)}")
         rows = th.as_tensor(np.atleast_2d(observation), dtype=th.float32, device=self.device)
         with th.no_grad():
             output = network(rows)

@@ -206,12 +206,15 @@ class JointReplayBuffer(ReplayBuffer):
 
         :raises ValueError: if the arrays are those of another buffer
         """
+        missing = [name for name in (*self._row_arrays(), *self._other_arrays()) if name not in arrays]
+        if missing:
+            raise ValueError(f"not a replay buffer of this model: it lacks {', '.join(missing)}")
         for name in self._row_arrays():
-            own = getattr(self, name)
-            if name not in arrays or arrays[name].shape[1:] != own.shape[1:] or len(arrays[name]) > len(own):
-                given = arrays[name].shape if name in arrays else "missing"
-                raise ValueError(f"not a replay buffer of this model: {name!r} is {given}, here {own.shape}")
-            own[: len(arrays[name])] = arrays[name]
+            given, own = arrays[name].shape, getattr(self, name).shape
+            if given[1:] != own[1:] or given[0] > own[0]:
+                raise ValueError(f"not a replay buffer of this model: {name!r} is {given}, here at most {own}")
+        for name in self._row_arrays():
+            getattr(self, name)[: len(arrays[name])] = arrays[name]
         position, full = (int(value) for value in arrays["position"])
         held = len(arrays["rewards"])
         self.full = bool(full) and held == self.buffer_size
@@ -221,3 +224,7 @@ class JointReplayBuffer(ReplayBuffer):
     def _row_arrays(self) -> tuple[str, ...]:
         """Names of the arrays whose first axis is time."""
         return ("observations", "next_observations", "actions", "rewards", "dones", "alive", "states", "next_states")
+
+    def _other_arrays(self) -> tuple[str, ...]:
+        """Names of the other arrays that a saved buffer must have."""
+        return ("position", "rng")

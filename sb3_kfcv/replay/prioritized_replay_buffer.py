@@ -8,6 +8,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 
+from sb3_kfcv.common.checks import require_between, require_count
 from sb3_kfcv.replay.joint_replay_buffer import JointReplayBuffer
 from sb3_kfcv.replay.ranks import importance_weights, rank_probabilities, stratified
 
@@ -19,8 +20,8 @@ class PrioritizedReplayBuffer(JointReplayBuffer):
 
     :param alpha: degree of prioritisation (Schaul et al.: 0.7 for ranks)
     :param beta_init: importance correction at the start (Schaul et al.: 0.5); grows linearly to 1 over training
-    :param sort_above: up to this many transitions ranks are exact at each draw; above, they are refreshed every
-        ``sort_every`` draws, since sorting would cost more than the update
+    :param sort_above: up to this many transitions the ranks are exact at each draw; above, they are refreshed every
+        ``sort_every`` draws, since sorting would cost as much as the update; new transitions wait until then
     :param sort_every: see ``sort_above``
 
     The other parameters are those of :class:`JointReplayBuffer`.
@@ -40,15 +41,15 @@ class PrioritizedReplayBuffer(JointReplayBuffer):
         alpha: float = 0.7,
         beta_init: float = 0.5,
         sort_above: int = 20_000,
-        sort_every: int = 100,
+        sort_every: int = 10,
     ) -> None:
         super().__init__(
             buffer_size, observation_space, action_space, device, n_envs, optimize_memory_usage, n_agents, state_size, seed
         )
-        if alpha < 0:
-            raise ValueError(f"alpha must be at least 0, got {alpha}")
-        if not 0 <= beta_init <= 1:
-            raise ValueError(f"beta_init must lie in [0, 1], got {beta_init}")
+        require_between("alpha", alpha, 0)
+        require_between("beta_init", beta_init, 0, 1)
+        require_count("sort_above", sort_above, least=0)
+        require_count("sort_every", sort_every)
         self.alpha, self.beta_init = alpha, beta_init
         self.sort_above, self.sort_every = sort_above, sort_every
         self.td_errors = np.full(self.buffer_size * n_envs, np.inf)  # |δ| of each row; infinite until replayed
@@ -70,8 +71,9 @@ class PrioritizedReplayBuffer(JointReplayBuffer):
     def _draw(self, batch_size: int) -> tuple[np.ndarray, np.ndarray | None]:
         n = self.n_rows
         self._draws_since_sort += 1
-        if n <= self.sort_above or len(self._by_rank) == 0 or self._draws_since_sort >= self.sort_every:
-            self._by_rank = np.argsort(-self.td_errors[:n], kind="stable")
+        exact = n <= self.sort_above
+        if exact or len(self._by_rank) == 0 or self._draws_since_sort >= self.sort_every:
+            self._by_rank = np.argsort(-self.td_errors[:n], kind="stable" if exact else "quicksort")
             self._draws_since_sort = 0
         n = len(self._by_rank)
         if len(self._probabilities) != n:
@@ -94,9 +96,15 @@ class PrioritizedReplayBuffer(JointReplayBuffer):
         return stats
 
     def state_arrays(self) -> dict[str, np.ndarray]:
-        return {**super().state_arrays(), "td_errors": self.td_errors[: self.n_rows]}
+        ranks = {"by_rank": self._by_rank, "draws_since_sort": np.array(self._draws_since_sort)}
+        return {**super().state_arrays(), "td_errors": self.td_errors[: self.n_rows], **ranks}
 
     def load_state_arrays(self, arrays: dict[str, np.ndarray]) -> None:
         super().load_state_arrays(arrays)
-        self.td_errors[: self.n_rows] = arrays["td_errors"]
-        self._by_rank = np.empty(0, dtype=np.int64)
+        self.td_errors[:] = np.inf
+        self.td_errors[: self.n_rows] = arrays["td_errors"][: self.n_rows]
+        self._by_rank = arrays["by_rank"].copy()
+        self._draws_since_sort = int(arrays["draws_since_sort"])
+
+    def _other_arrays(self) -> tuple[str, ...]:
+        return (*super()._other_arrays(), "td_errors", "by_rank", "draws_since_sort")

@@ -66,13 +66,13 @@ class JointEnv(gym.Env):
         env, names = self.parallel_env, self.layout.agents
         alive = np.array([agent in env.agents for agent in names])
         chosen = self._split(np.asarray(action))
-        observations, rewards, terminations, truncations, _ = env.step({agent: chosen[agent] for agent in env.agents})
+        observations, rewards, terminations, _, _ = env.step({agent: chosen[agent] for agent in env.agents})
         agent_rewards = np.array([rewards.get(agent, 0.0) for agent in names], dtype=np.float32)
         present = np.array([agent in env.agents for agent in names])
         self._gone = (self._gone | [bool(terminations.get(agent, False)) for agent in names]) & ~present
         self._returns += agent_rewards
         over = not env.agents
-        truncated = over and any(truncations.values())
+        truncated = over and not self._gone.all()
         info: dict[str, Any] = {
             "agent_rewards": agent_rewards,
             "agent_terminated": self._gone.copy(),
@@ -100,6 +100,8 @@ class JointEnv(gym.Env):
         return row
 
     def _split(self, action: np.ndarray) -> dict[str, Any]:
+        if action.shape != self.action_space.shape:
+            raise ValueError(f"a joint action has the shape {self.action_space.shape}; got {action.shape}")
         if self.layout.discrete:
             return {agent: int(choice) for agent, choice in zip(self.layout.agents, action, strict=True)}
         return {agent: action[columns] for agent, columns in zip(self.layout.agents, self.layout.action_slices, strict=True)}

@@ -1,0 +1,30 @@
+"""Settings are checked before time is spent: one sentence that names the setting and what it may be."""
+
+from __future__ import annotations
+
+from numbers import Integral
+
+
+def require_count(name: str, value: object, least: int = 1) -> None:
+    """
+    :param name: of the setting
+    :param value: must be a whole number of at least ``least``
+    :param least: smallest value allowed
+    :raises ValueError: if it is not
+    """
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
+
+
+def require_between(name: str, value: float, low: float, high: float = float("inf"), above: bool = False) -> None:
+    """
+    :param name: of the setting
+    :param value: must lie in [low, high]
+    :param low: smallest value allowed
+    :param high: largest value allowed
+    :param above: whether ``low`` itself is not allowed
+    :raises ValueError: if it does not
+    """
+    if not low <= value <= high or (above and value == low):
+        bounds = f"{'above' if above else 'at least'} {low:g}" + ("" if high == float("inf") else f" and at most {high:g}")
+        raise ValueError(f"{name} must be {bounds}, got {value!r}")
