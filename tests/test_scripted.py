@@ -176,10 +176,10 @@ class TestGrassland:
         force = scripted_policy("graze", grassland_layout(grass=2), "sheep").act(rows[:, 1:])[0, 0]
         np.testing.assert_allclose(force, [0, 1], atol=1e-6)
 
-    def test_graze_flees_when_a_wolf_is_close(self):
+    def test_graze_is_blind_to_wolves(self):
         rows = grassland_rows([[0, 0.15], [0, 0]], [[0, 0.3]])
         force = scripted_policy("graze", grassland_layout(), "sheep").act(rows[:, 1:])[0, 0]
-        assert force[1] == -1
+        assert force[1] == 1
 
     def test_the_dead_do_not_act(self):
         rows = grassland_rows([[0, 0], [0.2, 0], [0.5, 0.5]], [[0.5, 0]], alive=[1, 0, 1])

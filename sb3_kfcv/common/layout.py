@@ -121,7 +121,8 @@ class AgentLayout:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> AgentLayout:
         """Inverse of :meth:`to_dict`."""
-        return cls(**{key: tuple(value) if isinstance(value, list) else value for key, value in data.items()})
+        values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
+        return cls(**values)
 
 
 def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:

@@ -153,7 +153,7 @@ class StackedMLP(nn.Module):
         for layer in [self.first, *self.rest]:
             for parameter in (layer.weight, layer.bias):
                 squares += self._network_view(parameter.grad, layer).square().sum((1, 3)).flatten()
-        if self.member_bias is not None and self.member_bias.grad is not None:
+        if self.members is not None and self.member_bias is not None and self.member_bias.grad is not None:
             squares.index_add_(0, self.members, self.member_bias.grad.square().sum((1, 2)))
         return squares.sqrt()
 

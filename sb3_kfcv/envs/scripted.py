@@ -32,7 +32,6 @@ _SAFE_HALF_WIDTH = 0.82
 # may come to a grazing sheep. These three and the above were tuned on the world at its defaults.
 _LONGEST_LEAD = 0.3
 _FLIGHT = 0.3
-_FRIGHT = 0.25
 
 
 @dataclass(frozen=True)
@@ -308,19 +307,17 @@ class FleePolicy(GrasslandPolicy):
         return pick(spots, danger.argmin(axis=-1))
 
 
-class GrazePolicy(FleePolicy):
-    """A sheep goes to the nearest grass, blind to the wolves until one comes close; then, or without any grass, it flees."""
+class GrazePolicy(GrasslandPolicy):
+    """A sheep goes to the nearest grass, blind to the wolves; without any grass it stays."""
+
+    accel = SHEEP_ACCELERATION
 
     def wanted_velocity(self, observations: np.ndarray) -> np.ndarray:
         grass = self.grass(observations)
         if grass.shape[2] == 0:
-            return super().wanted_velocity(observations)
+            return approach_velocity(np.zeros_like(observations[..., :2]), self.accel)
         index, _ = nearest(grass)
-        wolves = self.others(observations, "wolf")
-        _, wolf_distance = nearest(wolves.position, wolves.alive)
-        to_grass = _kept_inside(pick(grass, index), observations[..., 2:4])
-        way = np.where((wolf_distance < _FRIGHT)[..., None], self.escape(observations), to_grass)
-        return approach_velocity(way, self.accel)
+        return approach_velocity(_kept_inside(pick(grass, index), observations[..., 2:4]), self.accel)
 
 
 def _kept_inside(offset: np.ndarray, position: np.ndarray) -> np.ndarray:

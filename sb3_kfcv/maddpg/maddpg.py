@@ -330,7 +330,7 @@ class MADDPG(OffPolicyAlgorithm):
         loss.backward()
         if self.max_grad_norm is not None:
             for stack in networks.stacks:
-                stack.clip_gradients(self.max_grad_norm)
+                stack.clip_gradients(self.max_grad_norm)  # type: ignore[operator]
         networks.optimizer.step()
 
     def predict(
@@ -372,7 +372,7 @@ class MADDPG(OffPolicyAlgorithm):
     ) -> tuple[np.ndarray, np.ndarray]:
         action, buffer_action = super()._sample_action(learning_starts, action_noise, n_envs)
         if self._opponent_policy is not None:  # neither the warm-up nor the noise is for the opponents
-            action = self._opponent_policy.fill(action, self._last_obs, deterministic=False)
+            action = self._opponent_policy.fill(action, np.asarray(self._last_obs), deterministic=False)
             buffer_action = self.policy.from_env(action)
         return action, buffer_action
 
@@ -478,7 +478,7 @@ class MADDPG(OffPolicyAlgorithm):
         """
         if isinstance(path, (str, pathlib.Path)):
             with atomic_write(with_suffix(path, ".zip")) as file:
-                super().save(file, exclude, include)
+                super().save(file, exclude, include)  # type: ignore[arg-type]
         else:
             super().save(path, exclude, include)
 
@@ -490,9 +490,9 @@ class MADDPG(OffPolicyAlgorithm):
         """
         if isinstance(path, (str, pathlib.Path)):
             with atomic_write(with_suffix(path, ".npz")) as file:
-                np.savez(file, **self.replay_buffer.state_arrays())
+                np.savez(file, **self.replay_buffer.state_arrays())  # type: ignore[arg-type]
         else:
-            np.savez(path, **self.replay_buffer.state_arrays())
+            np.savez(path, **self.replay_buffer.state_arrays())  # type: ignore[arg-type]
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """

@@ -43,7 +43,7 @@ class JointEnv(gym.Env):
         self.layout = AgentLayout.from_spaces(agents, observation_spaces, action_spaces, state_size(env))
         self.observation_space = joint_box([observation_spaces[agent] for agent in agents])
         self.action_space = (
-            spaces.MultiDiscrete(self.layout.action_sizes)
+            spaces.MultiDiscrete(list(self.layout.action_sizes))
             if self.layout.discrete
             else joint_box([action_spaces[agent] for agent in agents])
         )
@@ -93,7 +93,7 @@ class JointEnv(gym.Env):
         self.parallel_env.close()
 
     def _join(self, observations: dict[str, np.ndarray]) -> np.ndarray:
-        row = np.zeros(self.observation_space.shape, dtype=np.float32)
+        row = np.zeros(sum(self.layout.obs_sizes), dtype=np.float32)
         for agent, columns, gone in zip(self.layout.agents, self.layout.obs_slices, self._gone, strict=True):
             if agent in observations and not gone:
                 row[columns] = observations[agent]
