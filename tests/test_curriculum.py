@@ -31,8 +31,8 @@ class Student:
     def td_target(self, batch):
         return batch.rewards.T
 
-    def q_values(self, inputs):
-        return th.zeros(self.n_learning_agents, len(inputs))
+    def q_values(self, batch):
+        return th.zeros(self.n_learning_agents, len(batch.rows))
 
     def live(self, batch):
         return batch.alive.T

@@ -251,8 +251,8 @@ class MeanStudent:
     def td_target(self, batch):
         return batch.rewards.T
 
-    def q_values(self, inputs):
-        return th.zeros(2, len(inputs))
+    def q_values(self, batch):
+        return th.zeros(2, len(batch.rows))
 
     def live(self, batch):
         return batch.alive.T

@@ -132,7 +132,7 @@ class StackedMLP(nn.Module):
 
     def input_columns(self, members: th.Tensor, columns: th.Tensor) -> th.Tensor:
         """
-        First-layer weights of some inputs of some members, for networks that all read one input (``n_inputs=1``).
+        First-layer weights of some inputs of some members.
 
         :param members: (m,) numbers of the members
         :param columns: (m, k) positions in the input
@@ -145,7 +145,10 @@ class StackedMLP(nn.Module):
     def _columns(self, weight: th.Tensor, members: th.Tensor | slice, columns: th.Tensor) -> th.Tensor:
         """Rows of the first layer's weight for some members, (members, columns, hidden)."""
         everyone = th.arange(self.n_networks, device=weight.device) if self.members is None else self.members
-        return weight[0].unflatten(-1, (self.n_networks, self.sizes[1]))[columns, everyone[members][:, None]]
+        networks = everyone[members][:, None]
+        if self.input_per_member:
+            return weight[networks, columns]
+        return weight[0].unflatten(-1, (self.n_networks, self.sizes[1]))[columns, networks]
 
     def gradient_norms(self) -> th.Tensor:
         """Euclidean norm of each network's gradient: (networks,)."""

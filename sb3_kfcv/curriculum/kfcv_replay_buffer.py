@@ -205,8 +205,8 @@ class KFCVReplayBuffer(JointReplayBuffer):
         """Train the teachers, score every transition, rank them into buckets: the assessment of section 4.1."""
         start = time.perf_counter()
         n = self.n_rows
-        inputs, targets, live = self._read_all()
-        student_errors = (targets - self._student_values(inputs)).square()
+        inputs, targets, values, live = self._read_all()
+        student_errors = (targets - values).square()
         if self.score == "student":
             scores = combine_agents(student_errors, live)
         else:
@@ -221,16 +221,16 @@ class KFCVReplayBuffer(JointReplayBuffer):
         self.n_refreshes += 1
         self._refresh_seconds += time.perf_counter() - start
 
-    def _read_all(self) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """Critic inputs (n, features), TD targets (agents, n), and 1 where the agent lived (agents, n), of all rows."""
+    def _read_all(self) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
+        """Critic inputs (n, features); TD targets, the student's Q, and 1 where the agent lived, (agents, n), of all rows."""
         n, student = self.n_rows, self.student
         batches = (self.rows(np.arange(first, min(first + CHUNK, n))) for first in range(0, n, CHUNK))
-        parts = [(student.critic_inputs(batch), student.td_target(batch), student.live(batch)) for batch in batches]
-        inputs, targets, live = zip(*parts, strict=True)
-        return th.cat(inputs), th.cat(targets, dim=1), th.cat(live, dim=1)
-
-    def _student_values(self, inputs: th.Tensor) -> th.Tensor:
-        return th.cat([self.student.q_values(part) for part in inputs.split(CHUNK)], dim=1)
+        parts = [
+            (student.critic_inputs(batch), student.td_target(batch), student.q_values(batch), student.live(batch))
+            for batch in batches
+        ]
+        inputs, targets, values, live = zip(*parts, strict=True)
+        return th.cat(inputs), th.cat(targets, dim=1), th.cat(values, dim=1), th.cat(live, dim=1)
 
     def _teacher_scores(self, inputs: th.Tensor, targets: th.Tensor, live: th.Tensor) -> np.ndarray:
         """Train the teachers on their folds, and score every row by those that have not seen it (eq. 9–11): (n,)."""

@@ -10,7 +10,7 @@ import torch as th
 from sb3_kfcv.common.layout import AgentLayout
 
 if TYPE_CHECKING:
-    from sb3_kfcv.maddpg.policies import StackedActors, StackedCritics
+    from sb3_kfcv.maddpg.policies import OwnObservationCritics, StackedActors, StackedCritics
 
 # Logged values are means over this many of the latest updates.
 WINDOW = 100
@@ -47,7 +47,7 @@ class Diagnostics:
         self._actor_losses.append(losses.detach())
         self._own_actions = [actions.detach() for actions in own_actions]
 
-    def series(self, actor: StackedActors, critic: StackedCritics) -> dict[str, float]:
+    def series(self, actor: StackedActors, critic: StackedCritics | OwnObservationCritics) -> dict[str, float]:
         """
         Name → value of everything to log; losses and Q-values per group, gradient norms of the latest update.
 
@@ -75,5 +75,5 @@ class Diagnostics:
                 values[f"{key}_{group}"] = stacked[:, positions].mean().item()
 
 
-def _mean_norm(networks: StackedActors | StackedCritics) -> float:
+def _mean_norm(networks: StackedActors | StackedCritics | OwnObservationCritics) -> float:
     return th.cat([stack.gradient_norms() for stack in networks.stacks]).mean().item()  # type: ignore[operator]

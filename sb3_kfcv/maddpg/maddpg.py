@@ -25,7 +25,15 @@ from sb3_kfcv.common.files import atomic_write, with_suffix
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.team_policy import TeamPolicy
 from sb3_kfcv.maddpg.diagnostics import Diagnostics
-from sb3_kfcv.maddpg.policies import MADDPGPolicy, MlpPolicy, StackedActors, StackedCritics
+from sb3_kfcv.maddpg.policies import (
+    CRITIC_INPUTS,
+    MADDPGPolicy,
+    MlpPolicy,
+    OwnObservationCritics,
+    StackedActors,
+    StackedCritics,
+    by_agent,
+)
 from sb3_kfcv.replay import JointReplayBuffer, JointReplayBufferSamples
 from sb3_kfcv.vec_env.make import layout_of, wrap_env
 
@@ -60,8 +68,9 @@ class MADDPG(OffPolicyAlgorithm):
     :param replay_buffer_class: by default the one of the algorithm
     :param replay_buffer_kwargs: settings of the replay buffer
     :param optimize_memory_usage: not supported
-    :param critic_input: ``"observations"`` (all agents', as in the paper) or ``"state"`` (the world's ``state()``, which
-        makes the critics' first layer many times smaller where the world is fully observable)
+    :param critic_input: what critics see beside all actions: ``"observations"`` (all agents', as in the paper), ``"state"``
+        (the world's ``state()``) or ``"own_observation"`` (the agent's own); the latter two make the critics' first layer
+        many times smaller, and lose nothing where every agent sees the whole world
     :param share_parameters: one actor and one critic per group of agents instead of per agent. The critic reads the joint
         input with the agent itself first; both tell the agents apart by a learnt bias, as by a one-hot index in the input
     :param team: learn only the agents of this group; the others act by ``opponents``
@@ -91,8 +100,8 @@ class MADDPG(OffPolicyAlgorithm):
     replay_buffer: JointReplayBuffer
     actor: StackedActors
     actor_target: StackedActors
-    critic: StackedCritics
-    critic_target: StackedCritics
+    critic: StackedCritics | OwnObservationCritics
+    critic_target: StackedCritics | OwnObservationCritics
 
     def __init__(
         self,
@@ -180,7 +189,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.n_learning_agents = len(self.agents)
         self._agent_of_column = [i for i, size in enumerate(layout.action_sizes) for _ in range(size)]
         self._opponent_policy = self._make_opponent_policy()
-        state_size = layout.state_size if self.critic_input == "state" else 0
+        state_size = 0 if self.critic_input == "observations" else layout.state_size
         if self.action_noise is None and not layout.discrete and self.exploration_noise > 0:
             size = sum(layout.action_sizes)
             self.action_noise = NormalActionNoise(np.zeros(size), np.full(size, self.exploration_noise), dtype=np.float32)
@@ -202,7 +211,8 @@ class MADDPG(OffPolicyAlgorithm):
         super()._setup_model()
         self.policy_kwargs, self.replay_buffer_kwargs = users_kwargs
         self._create_aliases()
-        self.critic_input_size = self.critic.input_size
+        seen = layout.state_size if self._teachers_see_state else sum(layout.obs_sizes)
+        self.critic_input_size = seen + sum(layout.action_sizes)
         self._watch = Diagnostics(layout, self.agents)
         self._episode_metrics: deque[dict[str, float]] = deque(maxlen=self._stats_window_size)
         self.replay_buffer.attach(self)
@@ -210,8 +220,8 @@ class MADDPG(OffPolicyAlgorithm):
     def _check_settings(self) -> None:
         """Refuse what cannot train, before anything is built."""
         layout = self.layout
-        if self.critic_input not in ("observations", "state"):
-            raise ValueError(unknown_name("critic_input", self.critic_input, ["observations", "state"]))
+        if self.critic_input not in CRITIC_INPUTS:
+            raise ValueError(unknown_name("critic_input", self.critic_input, CRITIC_INPUTS))
         if self.critic_input == "state" and not layout.state_size:
             raise ValueError('critic_input="state" needs a world that has a state(); this one has none')
         for name in ("buffer_size", "batch_size", "policy_delay"):
@@ -257,7 +267,7 @@ class MADDPG(OffPolicyAlgorithm):
             live = self.live(batch)  # (agents, batch): a dead agent's rows enter no loss
 
             # Eq. 5: minimise (y − Q)², y = r + γ Q'(s', a'_1 … a'_N)
-            inputs = self.critic_inputs(batch)
+            inputs = self._critic_inputs(batch.observations, batch.states, self.policy.encode(batch.actions), batch.alive)
             targets = self.td_target(batch)  # (agents, batch)
             errors = targets - self.critic(inputs)  # (critics, agents, batch)
             critic_losses = live_mean(errors.square() * batch.weights, live)  # (critics, agents)
@@ -267,7 +277,7 @@ class MADDPG(OffPolicyAlgorithm):
             if self._n_updates % self.policy_delay == 0:
                 own_actions, raw = self.actor.relaxed(batch.observations, self.gumbel_temperature)
                 actor_losses = -live_mean(self.critic.with_own_actions(inputs, own_actions), live)  # (agents,)
-                sizes = self.actor.by_agent([output.square().mean(-1) for output in raw])  # (agents, batch)
+                sizes = by_agent(self.actor.blocks, [output.square().mean(-1) for output in raw])  # (agents, batch)
                 penalty = self.actor_regularization * live_mean(sizes, live).sum()
                 self._minimise(self.actor, actor_losses.sum() + penalty)
                 self._watch.actors(actor_losses, own_actions)
@@ -297,13 +307,24 @@ class MADDPG(OffPolicyAlgorithm):
         return self.reward_scale * batch.rewards.T[self.agents] + self.gamma * continues * next_q_values
 
     def critic_inputs(self, batch: JointReplayBufferSamples) -> th.Tensor:
-        """(batch, features): all observations, or the world's state, and then all actions; a dead agent's action is 0."""
-        return self._critic_inputs(batch.observations, batch.states, self.policy.encode(batch.actions), batch.alive)
+        """
+        All observations, or the world's state, and then all actions; a dead agent's action is 0. Critics of own
+        observations have no input in common: in their place stands the state, or all observations if there is none.
+
+        :return: (batch, features)
+        """
+        seen = batch.states if self._teachers_see_state else batch.observations
+        return th.cat([seen, self.policy.encode(batch.actions) * batch.alive[:, self._agent_of_column]], dim=1)
 
     @th.no_grad()
-    def q_values(self, inputs: th.Tensor) -> th.Tensor:
-        """(agents, batch): each learning agent's first critic on :meth:`critic_inputs`."""
+    def q_values(self, batch: JointReplayBufferSamples) -> th.Tensor:
+        """(agents, batch): each learning agent's first critic."""
+        inputs = self._critic_inputs(batch.observations, batch.states, self.policy.encode(batch.actions), batch.alive)
         return self.critic(inputs)[0]
+
+    @property
+    def _teachers_see_state(self) -> bool:
+        return self.critic_input != "observations" and self.layout.state_size > 0
 
     def live(self, batch: JointReplayBufferSamples) -> th.Tensor:
         """(agents, batch): 1 where the learning agent lived at the start of the step."""
@@ -325,7 +346,7 @@ class MADDPG(OffPolicyAlgorithm):
             actions = self.policy.encode(th.as_tensor(self.policy.from_env(others), device=self.device))
         return actions
 
-    def _minimise(self, networks: StackedActors | StackedCritics, loss: th.Tensor) -> None:
+    def _minimise(self, networks: StackedActors | StackedCritics | OwnObservationCritics, loss: th.Tensor) -> None:
         networks.optimizer.zero_grad()
         loss.backward()
         if self.max_grad_norm is not None:

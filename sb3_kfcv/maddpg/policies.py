@@ -45,6 +45,13 @@ class Block:
         return [Block(layout, members, [list(agents).index(i) for i in members]) for members in shapes.values()]
 
 
+def by_agent(blocks: Sequence[Block], values: Sequence[th.Tensor]) -> th.Tensor:
+    """Values per block, (agents of the block, …) each, in the order of the learning agents: (agents, …)."""
+    if len(values) == 1:
+        return values[0]
+    return th.cat(list(values))[th.cat([block.positions for block in blocks]).argsort()]
+
+
 class _Columns:
     """Equal-sized column ranges of a joint row, read and written as (agents, batch, size); a view where they adjoin."""
 
@@ -131,12 +138,6 @@ class StackedActors(nn.Module):
             return [th.tanh(output) for output in outputs], outputs
         return [F.gumbel_softmax(logits, tau=temperature, hard=True) for logits in outputs], outputs
 
-    def by_agent(self, values: list[th.Tensor]) -> th.Tensor:
-        """Values per block, (agents of the block, …) each, in the order of the learning agents: (agents, …)."""
-        if len(values) == 1:
-            return values[0]
-        return th.cat(values)[th.cat([block.positions for block in self.blocks]).argsort()]
-
     def network(self, agent: int) -> nn.Sequential:
         """The network of one agent, as separate ``nn.Linear`` layers (a copy; its last layer is linear)."""
         for stack, block in zip(self.stacks, self.blocks, strict=True):
@@ -209,13 +210,95 @@ class StackedCritics(nn.Module):
             old = block.action_columns.read(inputs[:, self.actions_start :])
             own_columns = stack.input_columns(block.positions, self.actions_start + block.action_columns.index)
             moved.append(th.baddbmm(z[block.positions] if len(self.blocks) > 1 else z, new - old, own_columns))
-        if len(self.blocks) > 1:
-            moved = [th.cat(moved)[th.cat([block.positions for block in self.blocks]).argsort()]]
-        return stack.after_first_layer(moved[0], frozen=True).squeeze(-1)
+        return stack.after_first_layer(by_agent(self.blocks, moved), frozen=True).squeeze(-1)
 
     def network(self, position: int, critic: int = 0) -> nn.Sequential:
         """One critic as separate ``nn.Linear`` layers (a copy); ``position`` counts the learning agents."""
         return self.stacks[critic].network(position)  # type: ignore[operator]
+
+
+class OwnObservationCritics(nn.Module):
+    """
+    Critics Q_i(o_i, a_1 … a_N) that see their agent's own observation and all actions. Where the agent sees the whole
+    world from its own place, nothing is lost, the input is many times smaller than all observations together, and what
+    counts (how far is the nearest sheep?) need not be worked out from absolute positions.
+
+    The parameters are those of :class:`StackedCritics`; inputs are all observations, then the joint action.
+    """
+
+    optimizer: th.optim.Optimizer
+
+    def __init__(
+        self,
+        layout: AgentLayout,
+        agents: Sequence[int],
+        critic_input: str,
+        net_arch: list[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+        n_critics: int = 1,
+        share_parameters: bool = False,
+    ) -> None:
+        super().__init__()
+        n_actions = sum(layout.action_sizes)
+        self.actions_start = sum(layout.obs_sizes)
+        self.blocks = Block.split(layout, agents)
+        order = ego_order(layout, agents, critic_input) if share_parameters else th.arange(n_actions).repeat(len(agents), 1)
+        self.read_order = [order[block.positions].argsort(1) for block in self.blocks]  # (agents, joint action)
+        self.own_slots = [  # (agents, action) in the input of the networks
+            block.obs_size + order[block.positions].gather(1, block.action_columns.index) for block in self.blocks
+        ]
+        self.stacks = nn.ModuleList()  # critic after critic, block after block
+        for _ in range(n_critics):
+            for block in self.blocks:
+                members = shared_members(layout, block.agents) if share_parameters else None
+                n_networks = max(members) + 1 if members else len(block.agents)
+                sizes = [block.obs_size + n_actions, *net_arch, 1]
+                self.stacks.append(StackedMLP(n_networks, sizes, activation_fn, members=members))
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        """
+        :param inputs: (batch, all observations, then joint action)
+        :return: Q-values (critics, agents, batch)
+        """
+        read = self._read(inputs)
+        values = [stack(read[i % len(read)]).squeeze(-1) for i, stack in enumerate(self.stacks)]
+        critics = [values[first : first + len(read)] for first in range(0, len(values), len(read))]
+        return th.stack([by_agent(self.blocks, critic) for critic in critics])
+
+    def with_own_actions(self, inputs: th.Tensor, own_actions: list[th.Tensor]) -> th.Tensor:
+        """See :meth:`StackedCritics.with_own_actions`."""
+        values = []
+        for i, (block, read, new) in enumerate(zip(self.blocks, self._read(inputs), own_actions, strict=True)):
+            stack: StackedMLP = self.stacks[i]  # type: ignore[assignment]
+            with th.no_grad():
+                z = stack.first_layer(read)
+            old = block.action_columns.read(inputs[:, self.actions_start :])
+            own_columns = stack.input_columns(th.arange(len(block.agents)), self.own_slots[i])
+            values.append(stack.after_first_layer(th.baddbmm(z, new - old, own_columns), frozen=True).squeeze(-1))
+        return by_agent(self.blocks, values)
+
+    def network(self, position: int, critic: int = 0) -> nn.Sequential:
+        """One critic as separate layers (a copy); it reads the own observation, then the actions in its ``read_order``."""
+        for i, block in enumerate(self.blocks):
+            if position in block.positions:
+                stack = self.stacks[critic * len(self.blocks) + i]
+                return stack.network(block.positions.tolist().index(position))  # type: ignore[operator]
+        raise ValueError(f"there is no learning agent {position}")
+
+    def _read(self, inputs: th.Tensor) -> list[th.Tensor]:
+        """What the networks of each block read: (agents, batch, own observation and all actions)."""
+        actions = inputs[:, self.actions_start :]
+        return [
+            th.cat([block.obs_columns.read(inputs[:, : self.actions_start]), actions[:, order].transpose(0, 1)], dim=-1)
+            for block, order in zip(self.blocks, self.read_order, strict=True)
+        ]
+
+
+CRITIC_INPUTS: dict[str, type[StackedCritics] | type[OwnObservationCritics]] = {
+    "observations": StackedCritics,
+    "state": StackedCritics,
+    "own_observation": OwnObservationCritics,
+}
 
 
 def shared_members(layout: AgentLayout, agents: Sequence[int]) -> list[int]:
@@ -231,11 +314,11 @@ def ego_order(layout: AgentLayout, agents: Sequence[int], critic_input: str) -> 
 
     :param layout: who sits where in the joint rows
     :param agents: the learning agents
-    :param critic_input: ``"observations"`` or ``"state"``, what stands before the joint action
+    :param critic_input: what stands before the joint action; ``"own_observation"`` counts as nothing
     :return: (agents, input) which input of the shared network takes each column
     :raises ValueError: if agents of a group have different spaces
     """
-    n_seen = layout.state_size if critic_input == "state" else sum(layout.obs_sizes)
+    n_seen = {"observations": sum(layout.obs_sizes), "state": layout.state_size, "own_observation": 0}[critic_input]
     parts = [(n_seen, layout.action_slices)]
     if critic_input == "observations":
         parts.append((0, layout.obs_slices))
@@ -262,7 +345,7 @@ class MADDPGPolicy(BasePolicy):
     :param lr_schedule: learning rate of actors and critics
     :param layout: who sits where in the joint rows; set by the algorithm
     :param agents: the learning agents; set by the algorithm
-    :param critic_input: ``"observations"`` or ``"state"``; set by the algorithm
+    :param critic_input: a key of ``CRITIC_INPUTS``; set by the algorithm
     :param net_arch: hidden sizes of both kinds, or ``dict(pi=[…], qf=[…])``; Table 1: 64 (two layers, as MADDPG has)
     :param activation_fn: activation between layers
     :param n_critics: critics per agent
@@ -273,8 +356,8 @@ class MADDPGPolicy(BasePolicy):
 
     actor: StackedActors
     actor_target: StackedActors
-    critic: StackedCritics
-    critic_target: StackedCritics
+    critic: StackedCritics | OwnObservationCritics
+    critic_target: StackedCritics | OwnObservationCritics
 
     def __init__(
         self,
@@ -318,8 +401,10 @@ class MADDPGPolicy(BasePolicy):
         def make_actor() -> StackedActors:
             return StackedActors(layout, agents, actor_arch, activation_fn, share_parameters)
 
-        def make_critic() -> StackedCritics:
-            return StackedCritics(layout, agents, critic_input, critic_arch, activation_fn, n_critics, share_parameters)
+        def make_critic() -> StackedCritics | OwnObservationCritics:
+            return CRITIC_INPUTS[critic_input](
+                layout, agents, critic_input, critic_arch, activation_fn, n_critics, share_parameters
+            )
 
         self.actor, self.actor_target = make_actor(), make_actor()
         self.critic, self.critic_target = make_critic(), make_critic()

@@ -38,13 +38,13 @@ class Student(Protocol):
     critic_input_size: int
 
     def critic_inputs(self, batch: JointReplayBufferSamples) -> th.Tensor:
-        """What its critics read: (batch, features)."""
+        """What a critic of its world reads: (batch, features)."""
 
     def td_target(self, batch: JointReplayBufferSamples) -> th.Tensor:
         """The TD target y: (agents, batch)."""
 
-    def q_values(self, inputs: th.Tensor) -> th.Tensor:
-        """Its critics' estimates for :meth:`critic_inputs`: (agents, batch)."""
+    def q_values(self, batch: JointReplayBufferSamples) -> th.Tensor:
+        """Its critics' estimates: (agents, batch)."""
 
     def live(self, batch: JointReplayBufferSamples) -> th.Tensor:
         """1 where the learning agent lived: (agents, batch)."""
