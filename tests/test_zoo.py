@@ -5,7 +5,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for the package ``zoo``, which is not installed
 
 from sb3_kfcv import ALGOS, KFCVMADDPG, make_vec_env
 from sb3_kfcv.common.callbacks import StopOnSignal, TrainByTheClock

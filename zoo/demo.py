@@ -125,7 +125,7 @@ def plot_learning_curve(measured: Mapping[str, np.ndarray], env: VecEnv, path: P
     :param env: worlds in which the scripted players are measured
     :param path: of the PNG
     """
-    figure, axes = new_figure(2, "Grassland: learned players against scripted ones (mean and 95 % interval over episodes)")
+    figure, axes = new_figure(2, "Grassland-v0: mean and 95 % interval over the episodes of one training run")
     for axis, group in zip(axes, YARDSTICKS, strict=True):
         (rival,) = YARDSTICKS[group].values()
         draw_curve(
@@ -137,8 +137,8 @@ def plot_learning_curve(measured: Mapping[str, np.ndarray], env: VecEnv, path: P
         }
         draw_references(axis, scripted)
         axis.set_xlabel("training (env steps)")
-        axis.set_ylabel(f"return per {group} (reward, sum of an episode)")
-        axis.set_title(f"{group} against the scripted {rival!r}")
+        axis.set_ylabel(f"return per {group} (reward per episode)")
+        axis.set_title(f"learned {group} against scripted {rival!r}")
         axis.legend(fontsize="small")
     save_figure(figure, path)
 

@@ -37,7 +37,10 @@ def evaluate(policy: JointModel, env: VecEnv, n_episodes: int, deterministic: bo
     :param deterministic: without exploration
     :return: ``reward`` (the sum of the scalar rewards), ``length`` (steps) and each of the worlds' episode metrics,
         every one (episodes,), in the order in which the episodes ended
+    :raises ValueError: for less than one episode
     """
+    if n_episodes < 1:
+        raise ValueError(f"n_episodes is {n_episodes}; it must be at least 1")
     shares = (n_episodes + np.arange(env.num_envs)) // env.num_envs
     played = np.zeros(env.num_envs, dtype=int)
     rewards_so_far, steps_so_far = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=int)

@@ -13,7 +13,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -246,6 +246,9 @@ class MADDPG(OffPolicyAlgorithm):
         others = [group for group in self.layout.group_names if self.team and group != self.team]
         if not others:
             return None
+        if not self.opponents:
+            example = {group: "random" for group in others}
+            raise ValueError(f"team={self.team!r} needs players for the other groups, such as opponents={example}")
         return TeamPolicy(self.layout, self.opponents or {}, np.random.default_rng(self.seed), groups=others)
 
     def _create_aliases(self) -> None:
@@ -482,6 +485,8 @@ class MADDPG(OffPolicyAlgorithm):
             raise ValueError(f"{path} is no model file, or it is damaged: {error}") from None
         if env is not None and layout_of(env) != model.layout:
             raise ValueError(f"the model in {path} is for {model.layout}; the env given has {layout_of(env)}")
+        if isinstance(model.action_noise, VectorizedActionNoise):  # made anew by learn() for the env's number of worlds
+            model.action_noise = model.action_noise.base_noise
         return model
 
     def save(
