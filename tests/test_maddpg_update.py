@@ -53,7 +53,7 @@ class SlowMADDPG:
     def __init__(self, model):
         self.model, self.layout = model, model.layout
         self.n_updates = 0
-        n_critics = len(model.critic.stacks)
+        n_critics = (model.policy_kwargs or {}).get("n_critics", 1)
         self.agents = model.agents  # those that learn; the others stand still
         self.nets = {
             "actor": {v: model.actor.network(v) for v in self.agents},
@@ -104,12 +104,12 @@ class SlowMADDPG:
     def update(self, batch):
         model, layout = self.model, self.layout
         self.n_updates += 1
-        state = model.critic_input == "state"
-        seen, next_seen = (batch.states, batch.next_states) if state else (batch.observations, batch.next_observations)
         actions = self.without_the_dead(self.encode(batch.actions), batch.alive)
         # Before anything moves: the learner draws the discrete actors' Gumbel noise for all agents of a shape at once.
         noise = self.gumbel_noise(batch) if layout.discrete and self.n_updates % model.policy_delay == 0 else None
         for v in self.agents:
+            seen = self.seen_by(v, batch.observations, batch.states)
+            next_seen = self.seen_by(v, batch.next_observations, batch.next_states)
             alive, gone = batch.alive[:, v], batch.dones[:, v]
             n_alive = alive.sum().clamp(min=1)
             with th.no_grad():
@@ -140,6 +140,11 @@ class SlowMADDPG:
             self.minimise(-gain, self.actor_adams[v], [self.nets["actor"][v]])
         if self.n_updates % model.policy_delay == 0:
             self.move_targets()
+
+    def seen_by(self, agent, observations, states):
+        """What an agent's critic sees beside the actions."""
+        own = observations[:, self.layout.obs_slices[agent]]
+        return {"observations": observations, "state": states, "own_observation": own}[self.model.critic_input]
 
     def gumbel_noise(self, batch):
         """Per agent (batch, choices): the same draws as the learner's, given the same seed."""
@@ -199,6 +204,12 @@ VARIANTS = {
     "twin critics, delayed actors": {"policy_delay": 2, "policy_kwargs": {"net_arch": [8, 7], "n_critics": 2}},
     "clipped gradients": {"max_grad_norm": 0.05},
     "critics of the state": {"critic_input": "state"},
+    "critics of the own observation": {"critic_input": "own_observation"},
+    "twin critics of the own observation": {
+        "critic_input": "own_observation",
+        "max_grad_norm": 0.05,
+        "policy_kwargs": {"net_arch": [8, 7], "n_critics": 2},
+    },
     "scaled rewards": {"reward_scale": 0.1, "gamma": 0.9, "tau": 0.3},
     "discrete": {"toy": {"discrete": True}},
     "discrete, twin, clipped": {

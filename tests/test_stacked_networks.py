@@ -11,7 +11,7 @@ from torch import nn
 
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.stacked_networks import StackedMLP
-from sb3_kfcv.maddpg.policies import StackedActors, StackedCritics
+from sb3_kfcv.maddpg.policies import OwnObservationCritics, StackedActors, StackedCritics
 
 SIZES = [5, 7, 6, 2]
 
@@ -192,6 +192,27 @@ def critics_of(layout, agents=None, **kwargs):
 def in_blocks(critics, per_agent):
     """Per-agent actions {agent: (batch, action)} as the per-block tensors that the stacks speak in."""
     return [th.stack([per_agent[i] for i in block.agents]) for block in critics.blocks]
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_critics_of_own_observations_equal_separate_networks(share):
+    """Each reads its agent's observation and all actions, with shared parameters the agent's own action first."""
+    layout = AgentLayout(("a_0", "a_1", "b_0", "b_1"), ("a", "a", "b", "b"), (3, 3, 2, 2), (2, 2, 1, 1))
+    critics = OwnObservationCritics(layout, range(4), "own_observation", [8, 6], n_critics=2, share_parameters=share)
+    inputs = th.randn(5, sum(layout.obs_sizes) + 6)
+    observations, actions = inputs[:, :-6], inputs[:, -6:]
+    orders = [[0, 1, 2, 3, 4, 5], [2, 3, 0, 1, 4, 5], [0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 5, 4]]
+    own = [th.randn(2, 5, 2), th.randn(2, 5, 1)]  # per block
+    for agent in range(4):
+        seen = observations[:, layout.obs_slices[agent]]
+        order = orders[agent] if share else list(range(6))
+        for critic in range(2):
+            theirs = critics.network(agent, critic)(th.cat([seen, actions[:, order]], dim=1)).squeeze(1)
+            close(critics(inputs)[critic, agent], theirs)
+        moved = actions.clone()
+        moved[:, layout.action_slices[agent]] = own[agent // 2][agent % 2]
+        theirs = critics.network(agent)(th.cat([seen, moved[:, order]], dim=1)).squeeze(1)
+        close(critics.with_own_actions(inputs, own)[agent], theirs)
 
 
 def test_actors_equal_separate_sb3_actors(layout):
