@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ import pytest
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
 
 from sb3_kfcv import ALGOS, KFCVMADDPG, make_vec_env
 from sb3_kfcv.common.callbacks import StopOnSignal, TrainByTheClock
