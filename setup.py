@@ -9,7 +9,7 @@ HERE = Path(__file__).parent
 setup(
     name="sb3-kfcv",
     version=(HERE / "sb3_kfcv" / "version.txt").read_text().strip(),
-    description="Multi-agent reinforcement learning that feels like Stable-Baselines3: MADDPG, prioritised and curriculum replay",
+    description="Multi-agent reinforcement learning that feels like Stable-Baselines3: MADDPG, curriculum replay",
     long_description=(HERE / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     license="MIT",

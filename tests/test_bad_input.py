@@ -246,3 +246,25 @@ def test_a_batch_of_actions_of_the_wrong_shape():
     env.reset()
     with refused(r"\(2, 6\).*3 worlds"):
         env.step(np.zeros((2, 6), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"replay_buffer_kwargs": {"n_fold": 3}}, 'unknown setting in replay_buffer_kwargs "n_fold"; did you mean "n_folds"?'),
+        ({"policy_kwargs": {"net_ach": [8]}}, 'unknown setting in policy_kwargs "net_ach"; did you mean "net_arch"?'),
+        ({"gamma": "0.9"}, "gamma must be a number, got '0.9'"),
+        ({"learning_starts": "a"}, "learning_starts must be a whole number"),
+        ({"train_freq": 0}, "train_freq must be a whole number of at least 1"),
+    ],
+)
+def test_settings_are_refused_by_name(settings, message):
+    with pytest.raises(ValueError) as error:
+        KFCVMADDPG("MlpPolicy", "HardSpread-v0", **settings)
+    assert message in str(error.value)
+
+
+def test_a_model_of_another_algorithm_is_refused(tmp_path):
+    PERMADDPG("MlpPolicy", "HardSpread-v0").save(tmp_path / "model")
+    with pytest.raises(ValueError, match=r"was saved by PERMADDPG; load it with PERMADDPG\.load"):
+        MADDPG.load(tmp_path / "model")

@@ -20,12 +20,12 @@ class Student:
     What critics read is the observation: (serial number / 1000, and two features).
     """
 
-    critic_input_size = 3
+    teacher_input_size = 3
 
     def __init__(self, n_agents=1):
         self.n_learning_agents = n_agents
 
-    def critic_inputs(self, batch):
+    def teacher_inputs(self, batch):
         return batch.observations
 
     def td_target(self, batch):

@@ -529,7 +529,7 @@ def test_priorities_are_the_mean_error_of_the_living():
     received = {}
     model.replay_buffer.update_priorities = lambda rows, errors: received.update(rows=rows, errors=errors)
     with th.no_grad():
-        y, inputs = model.td_target(batch), model.critic_inputs(batch)
+        y, inputs = model.td_target(batch), model.teacher_inputs(batch)
         deltas = th.stack([(y[v] - model.critic.network(v)(inputs).squeeze(1)).abs() for v in range(3)], dim=1)
     model.train(1, BATCH)
     expected = [

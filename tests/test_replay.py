@@ -243,9 +243,9 @@ class MeanStudent:
     """Knows nothing: all targets are the rewards, all Q-values 0."""
 
     n_learning_agents = 2
-    critic_input_size = 6
+    teacher_input_size = 6
 
-    def critic_inputs(self, batch):
+    def teacher_inputs(self, batch):
         return th.cat([batch.observations, batch.actions], dim=1)
 
     def td_target(self, batch):

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -165,7 +166,8 @@ def test_a_run_is_continued_to_its_end(tmp_path, capsys):
     assert stopped == 130
     printed = capsys.readouterr().out
     assert "stopped after 100 env steps" in printed
-    words = printed.rpartition("to go on: python zoo/train.py ")[2].split()
+    python, script, *words = shlex.split(printed.rpartition("to go on: ")[2])
+    assert (Path(python).absolute(), script) == (Path(sys.executable), "zoo/train.py")
 
     assert train.main(words) == 0
     run = run_folder(tmp_path, number=2)
@@ -364,3 +366,35 @@ def test_the_demo_makes_what_it_promises(tmp_path, capsys):
     assert {"learning_curve.png", "learning_curve.npz", "grassland.gif"} <= {path.name for path in tmp_path.iterdir()}
     with np.load(tmp_path / "learning_curve.npz") as measured:
         assert measured["return_wolf"].shape == (len(measured["timesteps"]), demo.EPISODES_PER_MEASUREMENT)
+
+
+def test_a_continued_run_takes_the_next_seed_and_keeps_to_its_algorithm_and_world(tmp_path, capsys):
+    train.main(command(tmp_path, "HardSpread-v0", "maddpg"))
+    (model,) = tmp_path.glob("maddpg/*/HardSpread-v0.zip")
+    for words in (["--algo", "maddpg", "--env", "Grassland-v0"], ["--algo", "kfcv_maddpg", "--env", "HardSpread-v0"]):
+        assert train.main([*words, "-i", str(model)]) == 2
+        assert "continue it with --algo maddpg --env HardSpread-v0" in capsys.readouterr().err
+    words = [
+        "--algo",
+        "maddpg",
+        "--env",
+        "HardSpread-v0",
+        "-i",
+        str(model),
+        "-n",
+        "10",
+        "-f",
+        str(tmp_path),
+        "--eval-freq",
+        "-1",
+    ]
+    assert train.main(words) == 0
+    begun, continued = (yaml.safe_load(file.read_text())["seed"] for file in sorted(tmp_path.glob("maddpg/*/*/args.yml")))
+    assert continued == begun + 1
+
+
+def test_a_log_folder_that_is_a_file_is_refused_in_a_sentence(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    words = command(tmp_path, "HardSpread-v0", "maddpg")
+    assert train.main([*words, "-f", str(tmp_path / "file")]) == 2
+    assert capsys.readouterr().err.startswith("error: the run cannot write its files")

@@ -83,7 +83,12 @@ def make_parser() -> Parser:
     add("--algo", default="kfcv_maddpg", help="maddpg, per_maddpg or kfcv_maddpg (default: %(default)s)")
     add("--env", default="Grassland-v0", help="id of the world (default: %(default)s)")
     add("-n", "--n-timesteps", type=whole_number, default=-1, help="env steps; with -i so many more (default: the YAML's)")
-    add("--seed", type=int, default=-1, help="-1 draws one at random and prints it (default: %(default)s)")
+    add(
+        "--seed",
+        type=int,
+        default=-1,
+        help="-1 draws one at random and prints it; with -i the next one (default: %(default)s)",
+    )
     add("-f", "--log-folder", default="logs", help="where run folders are made (default: %(default)s)")
     add("-tb", "--tensorboard-log", help='TensorBoard folder (default: the run folder); "" turns it off')
     add("-P", "--progress", action="store_true", help="show a progress bar with the time left")
@@ -160,6 +165,7 @@ def resolve(args: argparse.Namespace) -> Hyperparams:
         model_path = Path(args.trained_agent)
         if not model_path.is_file():
             raise ValueError(f"there is no model {model_path}")
+        continue_as_begun(args, model_path)
         config = RunFolder.of_model(model_path, args.env).config_file
         if config.exists():
             if args.preset or args.conf_file:
@@ -174,6 +180,25 @@ def resolve(args: argparse.Namespace) -> Hyperparams:
     if args.n_timesteps != -1 and not args.trained_agent:
         entry["n_timesteps"] = args.n_timesteps
     return check(args.algo, args.env, entry)
+
+
+def continue_as_begun(args: argparse.Namespace, model_path: Path) -> None:
+    """
+    Check a continued run against the one that made its model, and give it the next seed unless one is given.
+
+    :param args: the command line; its seed is set
+    :param model_path: the model, in the run folder of the first run
+    :raises ValueError: if the model is of another algorithm or world
+    """
+    for file in model_path.parent.glob("*/args.yml"):
+        begun = read_map(file)
+        if (begun["algo"], begun["env"]) != (args.algo, args.env):
+            raise ValueError(
+                f"{model_path} was trained by {begun['algo']} on {begun['env']}; "
+                f"continue it with --algo {begun['algo']} --env {begun['env']}"
+            )
+        if args.seed < 0:
+            args.seed = begun["seed"] + 1
 
 
 def make_env(hyperparams: Hyperparams, n_envs: int, seed: int, env_kwargs: dict[str, Any], training: bool) -> VecEnv:
@@ -300,7 +325,6 @@ def train(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseC
     :return: exit status
     """
     args, model = training.args, training.model
-    start_logs(training, folder)
     with StopOnSignal() as stop:
         try:
             model.learn(
@@ -322,10 +346,16 @@ def train(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseC
     return SIGNALLED + stop.received
 
 
+def interpreter() -> str:
+    """This Python as one types it: from the working directory where it lies below it."""
+    path = Path(sys.executable)
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+
+
 def continuing_command(args: argparse.Namespace, folder: RunFolder) -> str:
     """The command that continues a stopped run to the end that it had planned."""
     parser = make_parser()
-    words = ["python", "zoo/train.py", "--algo", args.algo, "--env", args.env, "-i", str(folder.last_model)]
+    words = [interpreter(), "zoo/train.py", "--algo", args.algo, "--env", args.env, "-i", str(folder.last_model)]
     for name in CARRIED_FLAGS:
         value = getattr(args, name)
         if value != parser.get_default(name):
@@ -350,8 +380,13 @@ def main(argv: Sequence[str] | None = None, extra_callbacks: Sequence[BaseCallba
     except (ValueError, gym.error.Error) as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_INPUT
-    folder = RunFolder.create(args.log_folder, args.algo, args.env)
-    words = ["python", "zoo/train.py", *(sys.argv[1:] if argv is None else argv)]
+    try:
+        folder = RunFolder.create(args.log_folder, args.algo, args.env)
+        start_logs(training, folder)
+    except OSError as error:
+        print(f"error: the run cannot write its files: {error}", file=sys.stderr)
+        return BAD_INPUT
+    words = [interpreter(), "zoo/train.py", *(sys.argv[1:] if argv is None else argv)]
     folder.describe(training.hyperparams.to_dict(), vars(args), shlex.join(words))
     print(f"{args.algo} on {args.env}, seed {args.seed}, in {folder.path}")
     if args.verbose > 0:

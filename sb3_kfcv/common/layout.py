@@ -81,6 +81,17 @@ class AgentLayout:
             state_size=int(state_size),
         )
 
+    def __str__(self) -> str:
+        """Such as ``2 wolf (23 observed, 2 acting), 1 sheep (23 observed, 2 acting)``."""
+        parts = []
+        for group in self.group_names:
+            members = self.members(group)
+            sizes = sorted({(self.obs_sizes[i], self.action_sizes[i]) for i in members})
+            kind = "choices" if self.discrete else "acting"
+            listed = "; ".join(f"{seen} observed, {acting} {kind}" for seen, acting in sizes)
+            parts.append(f"{len(members)} {group} ({listed})")
+        return ", ".join(parts)
+
     @property
     def n_agents(self) -> int:
         return len(self.agents)

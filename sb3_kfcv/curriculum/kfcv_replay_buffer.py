@@ -40,7 +40,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
 
     It knows transitions and the TD target of the learner that it is attached to, no particular algorithm.
 
-    :param n_folds: K: folds, teachers per agent, buckets and stages
+    :param n_folds: K: folds, teachers, buckets and stages
     :param refresh_every: updates between refreshes (Algorithm 1 as printed refreshes at every step, at many times the cost)
     :param refresh_fraction: refresh sooner when this share of the transitions is new (beyond 1: never sooner)
     :param scored_per_update: bound of the cost: refreshes are spaced so that at most this many transitions are scored
@@ -73,9 +73,9 @@ class KFCVReplayBuffer(JointReplayBuffer):
         n_folds: int = 5,
         refresh_every: int = 250,
         refresh_fraction: float = 0.25,
-        scored_per_update: int = 50,
+        scored_per_update: int = 35,
         teacher_steps: int = 25,
-        first_teacher_steps: int = 500,
+        first_teacher_steps: int = 300,
         teacher_batch_size: int = 128,
         teacher_learning_rate: float = 1e-3,
         teacher_net_arch: Sequence[int] = (128, 128),
@@ -89,7 +89,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
         )
         n_rows = self.buffer_size * n_envs
         require_count("n_folds", n_folds, least=2)
-        if not 2 <= n_folds <= n_rows:
+        if n_folds > n_rows:
             raise ValueError(f"n_folds must lie between 2 and the buffer's {n_rows} transitions, got {n_folds}")
         if stage_rule not in STAGE_RULES:
             raise ValueError(unknown_name("stage_rule", stage_rule, STAGE_RULES))
@@ -137,13 +137,13 @@ class KFCVReplayBuffer(JointReplayBuffer):
         """
         Meet the learner, and make its teachers.
 
-        :param student: gives critic inputs, TD targets and Q-values
+        :param student: gives the teachers' inputs, TD targets and Q-values
         """
         self.student = student
         self.teachers = Teachers(
             self.n_folds,
             student.n_learning_agents,
-            student.critic_input_size,
+            student.teacher_input_size,
             self.teacher_net_arch,
             self.teacher_learning_rate,
             self.device,
@@ -222,11 +222,11 @@ class KFCVReplayBuffer(JointReplayBuffer):
         self._refresh_seconds += time.perf_counter() - start
 
     def _read_all(self) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
-        """Critic inputs (n, features); TD targets, the student's Q, and 1 where the agent lived, (agents, n), of all rows."""
+        """Teacher inputs (n, features); TD targets, the student's Q, and 1 where the agent lived, (agents, n), of all rows."""
         n, student = self.n_rows, self.student
         batches = (self.rows(np.arange(first, min(first + CHUNK, n))) for first in range(0, n, CHUNK))
         parts = [
-            (student.critic_inputs(batch), student.td_target(batch), student.q_values(batch), student.live(batch))
+            (student.teacher_inputs(batch), student.td_target(batch), student.q_values(batch), student.live(batch))
             for batch in batches
         ]
         inputs, targets, values, live = zip(*parts, strict=True)
@@ -267,10 +267,9 @@ class KFCVReplayBuffer(JointReplayBuffer):
             "curriculum/refreshes": self.n_refreshes,
             "time/refresh_seconds": self._refresh_seconds,
         }
-        if self.n_refreshes == 0:
+        if self.n_refreshes == 0 or self.stage > self.n_folds:
             return stats
-        over = self.stage > self.n_folds
-        shares = bucket_shares(self.stage, self.n_folds, self.stage_rule) * (0 if over else 1 - self.lambda_now)
+        shares = bucket_shares(self.stage, self.n_folds, self.stage_rule) * (1 - self.lambda_now)
         for bucket, rows in enumerate(self._bucket_members()):
             stats[f"curriculum/share_bucket_{bucket + 1}"] = shares[bucket]
             if len(rows):

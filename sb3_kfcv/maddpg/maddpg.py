@@ -20,7 +20,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import polyak_update, safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_kfcv.common.checks import require_between, require_count
+from sb3_kfcv.common.checks import require_between, require_count, require_parameters
 from sb3_kfcv.common.files import atomic_write, with_suffix
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.team_policy import TeamPolicy
@@ -176,6 +176,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.reward_scale = reward_scale
         self.actor_regularization = actor_regularization
         self.gumbel_temperature = gumbel_temperature
+        self._algorithm = type(self).__name__
         if self.env is not None:
             self.layout = layout_of(self.env)
 
@@ -212,7 +213,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.policy_kwargs, self.replay_buffer_kwargs = users_kwargs
         self._create_aliases()
         seen = layout.state_size if self._teachers_see_state else sum(layout.obs_sizes)
-        self.critic_input_size = seen + sum(layout.action_sizes)
+        self.teacher_input_size = seen + sum(layout.action_sizes)
         self._watch = Diagnostics(layout, self.agents)
         self._episode_metrics: deque[dict[str, float]] = deque(maxlen=self._stats_window_size)
         self.replay_buffer.attach(self)
@@ -226,6 +227,12 @@ class MADDPG(OffPolicyAlgorithm):
             raise ValueError('critic_input="state" needs a world that has a state(); this one has none')
         for name in ("buffer_size", "batch_size", "policy_delay"):
             require_count(name, getattr(self, name))
+        require_count("learning_starts", self.learning_starts, least=0)
+        require_count("gradient_steps", self.gradient_steps, least=-1)
+        require_count("train_freq", self.train_freq[0] if isinstance(self.train_freq, tuple) else self.train_freq)
+        require_parameters("policy_kwargs", self.policy_kwargs, self.policy_class)
+        require_parameters("replay_buffer_kwargs", self.replay_buffer_kwargs, self.replay_buffer_class)  # type: ignore[arg-type]
+        require_between("reward_scale", self.reward_scale, 0, above=True)
         require_between("gamma", self.gamma, 0, 1)
         require_between("tau", self.tau, 0, 1)
         for name in ("exploration_noise", "target_policy_noise", "target_noise_clip", "actor_regularization"):
@@ -258,6 +265,12 @@ class MADDPG(OffPolicyAlgorithm):
         self.critic_target = self.policy.critic_target
 
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
+        """
+        Update all agents, as the inner loop of Algorithm 1.
+
+        :param gradient_steps: number of updates
+        :param batch_size: joint transitions of each
+        """
         start = time.perf_counter()
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])  # type: ignore[list-item]
@@ -265,7 +278,8 @@ class MADDPG(OffPolicyAlgorithm):
 
         for _ in range(gradient_steps):
             self._n_updates += 1
-            # Algorithm 1: "Sampling a minibatch of experience quadruples from D"
+            # Algorithm 1: "Sampling a minibatch of experience quadruples from D". The buffer decides what is drawn: all alike,
+            # by priority, or by the curriculum, whose folds, teachers, scores and stages it refreshes when due.
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             live = self.live(batch)  # (agents, batch): a dead agent's rows enter no loss
 
@@ -309,10 +323,10 @@ class MADDPG(OffPolicyAlgorithm):
         continues = 1 - batch.dones.T[self.agents]
         return self.reward_scale * batch.rewards.T[self.agents] + self.gamma * continues * next_q_values
 
-    def critic_inputs(self, batch: JointReplayBufferSamples) -> th.Tensor:
+    def teacher_inputs(self, batch: JointReplayBufferSamples) -> th.Tensor:
         """
-        All observations, or the world's state, and then all actions; a dead agent's action is 0. Critics of own
-        observations have no input in common: in their place stands the state, or all observations if there is none.
+        What a teacher reads: as the critics, all observations, or the world's state, and then all actions; a dead agent's
+        action is 0. Critics of own observations have no input in common: there it is the state, if the world has one.
 
         :return: (batch, features)
         """
@@ -453,7 +467,7 @@ class MADDPG(OffPolicyAlgorithm):
         """
         env = self._wrap_env(maybe_make_env(env, self.verbose), self.verbose)
         if layout_of(env) != self.layout:
-            raise ValueError(f"the model is for {self.layout}; the env given has {layout_of(env)}")
+            raise ValueError(f"the model is for {self.layout}; the env has {layout_of(env)}")
         super().set_env(env, force_reset)
         self._vec_normalize_env = unwrap_vec_normalize(env)
         self._check_settings()
@@ -477,14 +491,18 @@ class MADDPG(OffPolicyAlgorithm):
         env = None if env is None else cls._wrap_env(maybe_make_env(env, 0), 0)
         try:
             model = super().load(path, env, **kwargs)
-        except ValueError as error:
-            if "spaces do not match" not in str(error):
-                raise
-            raise ValueError(f"the model in {path} was trained for another world than the env given: {error}") from None
         except (AssertionError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"{path} is no model file, or it is damaged: {error}") from None
+        except ValueError as error:
+            if env is not None and "spaces do not match" in str(error):
+                raise ValueError(f"the model in {path} is for another world than {layout_of(env)}: {error}") from None
+            if "zip-file" in str(error):
+                raise ValueError(f"{path} is no model file, or it is damaged: {error}") from None
+            raise
         if env is not None and layout_of(env) != model.layout:
-            raise ValueError(f"the model in {path} is for {model.layout}; the env given has {layout_of(env)}")
+            raise ValueError(f"the model in {path} is for {model.layout}; the env has {layout_of(env)}")
+        if model._algorithm != cls.__name__:
+            raise ValueError(f"the model in {path} was saved by {model._algorithm}; load it with {model._algorithm}.load")
         if isinstance(model.action_noise, VectorizedActionNoise):  # made anew by learn() for the env's number of worlds
             model.action_noise = model.action_noise.base_noise
         return model

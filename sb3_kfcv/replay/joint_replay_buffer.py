@@ -35,10 +35,10 @@ class Student(Protocol):
     """What a buffer may ask of the learner that it serves; every result is without gradient."""
 
     n_learning_agents: int
-    critic_input_size: int
+    teacher_input_size: int
 
-    def critic_inputs(self, batch: JointReplayBufferSamples) -> th.Tensor:
-        """What a critic of its world reads: (batch, features)."""
+    def teacher_inputs(self, batch: JointReplayBufferSamples) -> th.Tensor:
+        """What a critic of all agents reads, the world and all actions: (batch, features)."""
 
     def td_target(self, batch: JointReplayBufferSamples) -> th.Tensor:
         """The TD target y: (agents, batch)."""
@@ -211,7 +211,9 @@ class JointReplayBuffer(ReplayBuffer):
             raise ValueError(f"not a replay buffer of this model: it lacks {', '.join(missing)}")
         for name in self._row_arrays():
             given, own = arrays[name].shape, getattr(self, name).shape
-            if given[1:] != own[1:] or given[0] > own[0]:
+            if given[1] != self.n_envs:
+                raise ValueError(f"not a replay buffer of this model: it is of {given[1]} worlds, here {self.n_envs}")
+            if given[2:] != own[2:] or given[0] > own[0]:
                 raise ValueError(f"not a replay buffer of this model: {name!r} is {given}, here at most {own}")
         for name in self._row_arrays():
             getattr(self, name)[: len(arrays[name])] = arrays[name]

@@ -118,7 +118,8 @@ def layout_of(env: VecEnv) -> AgentLayout:
         return env.get_attr("layout", [0])[0]
     except AttributeError:
         raise ValueError(
-            f"{env} has no agent layout: it is no multi-agent world. Give a PettingZoo parallel env or a JointEnv"
+            f"the env ({env.observation_space}, {env.action_space}) is no multi-agent world: it has no agent layout. "
+            "Give a PettingZoo parallel env or a JointEnv"
         ) from None
 
 
