@@ -412,15 +412,17 @@ def test_hard_spread_fixed_walls_come_from_the_seed():
     assert not np.array_equal(same, other)
 
 
+@pytest.mark.parametrize("n_steps", [1000, pytest.param(7000, marks=pytest.mark.expensive)])
 @pytest.mark.parametrize("behaviour", ["gather at a wall", "ram together", "random"])
-def test_hard_spread_agents_never_pass_a_wall_nor_leave_the_plane(behaviour):
+def test_hard_spread_agents_never_pass_a_wall_nor_leave_the_plane(behaviour, n_steps):
+    """50 worlds of 8 agents; the long form makes a million world steps in all."""
     n_worlds = 50
     worlds = HardSpreadWorlds(n_worlds, n_agents=8, wall_width=0.2, max_steps=10**6)
     worlds.seed(range(n_worlds))
     worlds.reset()
     walls = worlds.inner_walls
     rng = np.random.default_rng(0)
-    for step in range(1000):
+    for step in range(n_steps):
         if step % 25 == 0:
             chosen = walls[np.arange(n_worlds), rng.integers(2, size=n_worlds)]
             goal = (chosen + rng.normal(0, 0.4, (n_worlds, 2)))[:, np.newaxis]

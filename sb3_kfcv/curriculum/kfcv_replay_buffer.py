@@ -114,7 +114,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
 
         self.folds = assign_folds(n_rows, n_folds, self.rng)  # (rows,)
         self.scores = np.zeros(n_rows)  # (rows,) c_j of the last refresh
-        self.buckets = np.full(n_rows, UNSCORED)  # (rows,) 0 … K−1, or UNSCORED
+        self.buckets = np.full(n_rows, UNSCORED, dtype=np.int32)  # (rows,) 0 … K−1, or UNSCORED
         self._rows_of_bucket: list[np.ndarray] | None = None  # rebuilt after rows were overwritten or scored
         self._updates_since_refresh = 0
         self._new_since_refresh = 0
@@ -178,15 +178,17 @@ class KFCVReplayBuffer(JointReplayBuffer):
         if self.stage > self.n_folds or self.n_refreshes == 0:
             return rows
         members = self._bucket_members()
-        shares = bucket_shares(self.stage, self.n_folds, self.stage_rule) * [len(m) > 0 for m in members]
+        sizes = np.array([len(rows_of) for rows_of in members])
+        shares = bucket_shares(self.stage, self.n_folds, self.stage_rule) * (sizes > 0)
         if shares.sum() == 0:  # all of the stage's transitions have been overwritten since the last refresh
             return rows
         shares *= (1 - self.lambda_now) / shares.sum()
         points = (np.arange(batch_size) + self.rng.random()) / batch_size
         source = np.searchsorted(np.cumsum(shares), points, side="right")  # bucket, or K for the uniform share
-        for bucket, rows_of in enumerate(members):
-            here = np.flatnonzero(source == bucket)
-            rows[here] = rows_of[self.rng.integers(len(rows_of), size=len(here))] if len(here) else rows[here]
+        scored = source < self.n_folds
+        bucket = source[scored]
+        place = np.cumsum(sizes)[bucket] - 1 - self.rng.integers(sizes[bucket])
+        rows[scored] = np.concatenate(members)[place]
         return rows
 
     def _bucket_members(self) -> list[np.ndarray]:
