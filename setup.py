@@ -24,6 +24,8 @@ setup(
         "numpy>=1.26,<3",
         "numba>=0.60",
         "scipy>=1.11",
+        "psutil>=5.9",
+        "filelock>=3.12",
         "pillow>=10",
         "matplotlib>=3.8",
         "tensorboard>=2.15",
@@ -35,6 +37,7 @@ setup(
         "tests": [
             "pytest>=8",
             "pytest-xdist>=3.5",
+            "hypothesis>=6.100",
             "ruff>=0.8",
             "mypy>=1.13",
             "types-PyYAML",

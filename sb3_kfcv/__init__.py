@@ -1,21 +1,23 @@
 """Multi-agent reinforcement learning that feels like Stable-Baselines3."""
 
-from pathlib import Path
-
 import gymnasium as gym
 
 from sb3_kfcv.curriculum import KFCVReplayBuffer
 from sb3_kfcv.envs.registration import register as register_pettingzoo_ids
 from sb3_kfcv.kfcv_maddpg import KFCVMADDPG
-from sb3_kfcv.maddpg import MADDPG
+from sb3_kfcv.maddpg import MADDPG, MlpPolicy
 from sb3_kfcv.per_maddpg import PERMADDPG
+from sb3_kfcv.replay import JointReplayBuffer, PrioritizedReplayBuffer
+from sb3_kfcv.saving import FileFormatError, register
 from sb3_kfcv.vec_env import JointEnv, ParticleVecEnv, make_vec_env
 from sb3_kfcv.vec_env.make import WORLDS
-
-__version__ = (Path(__file__).parent / "version.txt").read_text().strip()
+from sb3_kfcv.version import __version__
 
 ALGOS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "per_maddpg": PERMADDPG, "kfcv_maddpg": KFCVMADDPG}
 
+register("MlpPolicy", MlpPolicy)
+for _buffer in (JointReplayBuffer, PrioritizedReplayBuffer, KFCVReplayBuffer):
+    register(_buffer.__name__, _buffer)
 register_pettingzoo_ids()
 for _world in WORLDS:
     if _world not in gym.registry:
@@ -26,8 +28,11 @@ __all__ = [
     "KFCVMADDPG",
     "MADDPG",
     "PERMADDPG",
+    "FileFormatError",
     "JointEnv",
     "KFCVReplayBuffer",
     "ParticleVecEnv",
+    "__version__",
     "make_vec_env",
+    "register",
 ]

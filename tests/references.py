@@ -79,3 +79,18 @@ def fill(buffer, layout, steps, seed=0, **rates):
         infos = random_infos(rng, layout, buffer.n_envs, **rates)
         actions = random_actions(rng, layout, buffer.n_envs)
         buffer.add(obs, next_obs, actions, np.zeros(buffer.n_envs), np.zeros(buffer.n_envs), infos)
+
+
+def assert_equal_trees(one, other, place="value"):
+    """Nested values alike: same types, same numbers."""
+    assert type(one) is type(other), place
+    if isinstance(one, dict):
+        assert one.keys() == other.keys(), place
+        for key in one:
+            assert_equal_trees(one[key], other[key], f"{place}/{key}")
+    elif isinstance(one, (list, tuple)):
+        assert len(one) == len(other), place
+        for i, (a, b) in enumerate(zip(one, other, strict=True)):
+            assert_equal_trees(a, b, f"{place}/{i}")
+    else:
+        np.testing.assert_array_equal(one, other, err_msg=place)

@@ -513,7 +513,7 @@ def test_actor_regularisation_adds_the_mean_squared_raw_output():
 
 
 def test_learning_rate_follows_its_schedule():
-    model = make_model(learning_rate=lambda remaining: 0.01 * remaining)
+    model = make_model(learning_rate="lin_1e-2")
     model._current_progress_remaining = 0.5
     serve(model, draw(model, 1))
     model.train(1, BATCH)

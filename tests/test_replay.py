@@ -1,16 +1,19 @@
 """The joint replay buffer, and prioritised replay by rank (eq. 3–4)."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from references import fill
+from references import assert_equal_trees, fill
 from scipy.stats import chisquare
 
 from sb3_kfcv import KFCVReplayBuffer
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.replay import JointReplayBuffer, PrioritizedReplayBuffer
 from sb3_kfcv.replay.ranks import importance_weights, rank_probabilities
+from sb3_kfcv.saving.values import check_writable
 
 LAYOUT = AgentLayout(("a_0", "a_1"), ("a", "a"), (2, 2), (1, 1), state_size=3)
 OBS, ACT = spaces.Box(-np.inf, np.inf, (4,), np.float32), spaces.Box(-1, 1, (2,), np.float32)
@@ -277,6 +280,10 @@ def used_buffer(name, size, seed=0, steps=25):
     return buffer
 
 
+def by_row(buffer):
+    return buffer.rewards.reshape(-1, buffer.rewards.shape[-1])[: buffer.n_rows]
+
+
 def use(buffer, times=10):
     """Draw and re-rank, add something new in between; the rows drawn."""
     drawn = []
@@ -293,22 +300,56 @@ def use(buffer, times=10):
 def test_a_restored_buffer_goes_on_as_the_saved_one(name, size):
     """Rows drawn, refreshes and re-rankings included, to the bit."""
     saved = used_buffer(name, size)
-    arrays = {key: np.array(value) for key, value in saved.state_arrays().items()}
+    state, transitions = deepcopy((saved.state(), saved.transitions()))
     restored = used_buffer(name, size, seed=7, steps=5)
-    restored.load_state_arrays(arrays)
-    for key, value in restored.state_arrays().items():
-        np.testing.assert_array_equal(value, arrays[key], err_msg=key)
+    restored.set_state(state, transitions)
+    assert_equal_trees(restored.state(), state)
+    assert_equal_trees(restored.transitions(), transitions)
     np.testing.assert_array_equal(use(saved), use(restored))
 
 
 @pytest.mark.parametrize("name", BUFFERS)
-def test_saved_arrays_need_no_pickle(name, tmp_path):
-    np.savez(tmp_path / "buffer.npz", **used_buffer(name, 40).state_arrays())
-    with np.load(tmp_path / "buffer.npz", allow_pickle=False) as arrays:
-        assert all(arrays[key].dtype != object for key in arrays)
+def test_a_buffer_is_made_of_plain_values(name):
+    check_writable(used_buffer(name, 40).state())
 
 
-def test_arrays_of_another_world_are_refused():
-    arrays = used_buffer("uniform", 40).state_arrays()
+@pytest.mark.parametrize("n_envs", [1, 2, 3])
+@pytest.mark.parametrize("size", [12, 40, 90])
+@pytest.mark.parametrize("name", BUFFERS)
+def test_the_latest_transitions_move_to_a_buffer_of_another_shape(name, size, n_envs):
+    """With what is noted of each: seen by looking up the rewards, which tell the transitions apart."""
+    saved = used_buffer(name, 40)
+    kind, kwargs = BUFFERS[name]
+    moved = make_buffer(kind, size=size, n_envs=n_envs, **kwargs)
+    moved.attach(MeanStudent())
+    moved.set_state(*deepcopy((saved.state(), saved.transitions())))
+    latest = saved.transitions()["rewards"].reshape(saved.n_rows, -1)
+    held = moved.transitions()["rewards"].reshape(moved.n_rows, -1)
+    assert moved.n_rows == min(saved.n_rows, size) // n_envs * n_envs
+    np.testing.assert_array_equal(held, latest[len(latest) - len(held) :])
+    for noted in ("td_errors", "folds", "scores", "buckets"):
+        if hasattr(saved, noted):
+            of = {row.tobytes(): value for row, value in zip(by_row(saved), getattr(saved, noted), strict=False)}
+            for row, value in zip(by_row(moved), getattr(moved, noted), strict=False):
+                assert of[row.tobytes()] == value, noted
+    use(moved)
+
+
+def test_transitions_are_given_from_a_step_on():
+    buffer = used_buffer("uniform", 40)
+    whole, part = buffer.transitions(), buffer.transitions(buffer.n_added - 7)
+    for name, values in whole.items():
+        np.testing.assert_array_equal(part[name], values[-7:])
+    assert len(buffer.transitions(buffer.n_added)["rewards"]) == 0
+
+
+def test_a_buffer_that_was_emptied_counts_anew():
+    buffer = used_buffer("uniform", 40)
+    buffer.reset()
+    assert (buffer.n_added, buffer.n_rows) == (0, 0)
+
+
+def test_transitions_of_another_world_are_refused():
+    saved = used_buffer("uniform", 40)
     with pytest.raises(ValueError, match=r"not a replay buffer of this model.*rewards"):
-        make_buffer(size=40, n_envs=2, n_agents=3).load_state_arrays(arrays)
+        make_buffer(size=40, n_envs=2, n_agents=3).set_state(saved.state(), saved.transitions())

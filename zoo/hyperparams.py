@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -11,13 +10,14 @@ from typing import Any
 
 import gymnasium as gym
 import yaml
-from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_kfcv import ALGOS
 from sb3_kfcv.common.naming import unknown_name
+from sb3_kfcv.common.schedules import schedule_of
 from sb3_kfcv.maddpg import MADDPG
 from sb3_kfcv.vec_env.make import WORLDS
+from zoo.run_folder import read_map
 from zoo.typed_settings import checked, resolve_classes, settings_of
 
 HYPERPARAMS = Path(__file__).parents[1] / "hyperparams"
@@ -45,7 +45,6 @@ OF_THE_RUN = {
     "normalize": bool | dict[str, Any],
     "env_kwargs": dict[str, Any],
 }
-LINEAR = re.compile(r"lin_(.+)")
 
 
 @dataclass
@@ -84,8 +83,6 @@ class Hyperparams:
         :param names: only these; all by default
         """
         kwargs = deepcopy({name: self.model[name] for name in (self.model if names is None else names)})
-        if isinstance(kwargs.get("learning_rate"), str):
-            kwargs["learning_rate"] = LinearSchedule(_start_of_schedule(kwargs["learning_rate"]), 0.0, 1.0)
         if isinstance(kwargs.get("train_freq"), list):
             kwargs["train_freq"] = tuple(kwargs["train_freq"])
         if "policy_kwargs" in kwargs:
@@ -129,23 +126,6 @@ def load_entry(algo: str, env_id: str, conf_file: str | Path | None = None, pres
     if not isinstance(tuned, dict):
         raise ValueError(f"the entry of {env_id} in {path} has no map {preset!r}")
     return merged(entry, tuned)
-
-
-def read_map(path: Path) -> dict[str, Any]:
-    """
-    A YAML file that holds a map.
-
-    :raises ValueError: if it is missing, no YAML, or something else
-    """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is no valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(content, dict):
-        raise ValueError(f"{path} holds no map of settings")
-    return content
 
 
 def parse_pairs(flag: str, pairs: Sequence[str]) -> dict[str, Any]:
@@ -208,7 +188,7 @@ def check(algo: str, env_id: str, entry: Mapping[str, Any]) -> Hyperparams:
     if run.setdefault("policy", "MlpPolicy") not in algorithm.policy_aliases:
         raise ValueError(unknown_name("policy", run["policy"], algorithm.policy_aliases))
     if isinstance(settings.get("learning_rate"), str):
-        _start_of_schedule(settings["learning_rate"])
+        schedule_of(settings["learning_rate"])
     settings["policy_kwargs"] = checked(
         "setting of policy_kwargs", settings.get("policy_kwargs") or {}, _policy_settings(algo, run["policy"])
     )
@@ -247,17 +227,3 @@ def _norm_reward_refusal() -> str:
 
 def _policy_settings(algo: str, policy: str) -> dict[str, Any]:
     return settings_of(ALGOS[algo].policy_aliases[policy], GIVEN_TO_POLICY)
-
-
-def _start_of_schedule(text: str) -> float:
-    """
-    Where a schedule such as ``lin_1e-3`` starts; it falls linearly to 0.
-
-    :raises ValueError: for anything else
-    """
-    match = LINEAR.fullmatch(text)
-    try:
-        return float(match.group(1) if match else "")
-    except ValueError:
-        message = f'hyperparameter learning_rate is "{text}"; it must be a number, or a linear schedule such as lin_1e-3'
-        raise ValueError(message) from None

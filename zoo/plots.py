@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from sb3_kfcv.common.evaluation import with_interval
-from sb3_kfcv.common.files import atomic_write
+from sb3_kfcv.saving.files import atomic_write
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers.
 ALGO_COLOURS = {"maddpg": "#0072B2", "per_maddpg": "#E69F00", "kfcv_maddpg": "#009E73"}

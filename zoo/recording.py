@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_kfcv.common.files import atomic_write
 from sb3_kfcv.common.team_policy import JointModel
+from sb3_kfcv.saving.files import atomic_write
 
 PAUSE = 5  # frames for which the last picture of an episode stands still
 

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import yaml
+from filelock import FileLock, Timeout
 
-from sb3_kfcv import __version__
-from sb3_kfcv.common.files import atomic_write
-
-LIBRARIES = ("stable_baselines3", "torch", "numpy", "gymnasium", "pettingzoo", "numba", "scipy")
+from sb3_kfcv.common.naming import unknown_name
+from sb3_kfcv.saving.archive import library_versions
+from sb3_kfcv.saving.files import atomic_write
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class RunFolder:
 
         <env>.zip                  the model at the end of training
         best_model.zip             the model of the best evaluation
-        rl_model_<N>_steps.zip     checkpoints
-        replay_buffer.npz          the replay buffer at the end, if it was to be saved
-        *_vecnormalize.npz         beside each model: its observation statistics, if it has any
+        rl_model_<N>_steps.zip     the latest checkpoints, from which the run can be resumed; models, too
+        transitions/               what their replay buffers hold
+        replay_buffer.zip          the replay buffer at the end, if it was to be saved
         evaluations.npz            every episode of every evaluation
         0.monitor.csv              every training episode
         events.out.tfevents.*      TensorBoard
@@ -70,6 +70,35 @@ class RunFolder:
         """The folder in which a saved model lies."""
         return cls(Path(model_path).parent, env_id)
 
+    @classmethod
+    def existing(cls, path: str | Path) -> RunFolder:
+        """
+        The folder of a run that was begun.
+
+        :raises ValueError: if it is none
+        """
+        path = Path(path)
+        found = sorted(path.glob("*/args.yml"))
+        if len(found) != 1:
+            near = [str(folder.parent.parent) for folder in path.parent.glob("*/*/args.yml")]
+            raise ValueError(
+                unknown_name("run folder", path, near) if near else f"{path} is no run folder: it has no */args.yml"
+            )
+        return cls(path, read_map(found[0])["env"])
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """
+        Keep other processes out while this one trains here; the system lets go of the lock when the process ends.
+
+        :raises ValueError: if one is at it
+        """
+        try:
+            with FileLock(self.path / ".lock", timeout=0):
+                yield
+        except Timeout:
+            raise ValueError(f"another process is training in {self.path}") from None
+
     @property
     def number(self) -> int:
         """k: the how-manieth run of this algorithm in this world it is."""
@@ -81,11 +110,15 @@ class RunFolder:
 
     @property
     def replay_buffer(self) -> Path:
-        return self.path / "replay_buffer.npz"
+        return self.path / "replay_buffer.zip"
 
     @property
     def monitor_file(self) -> Path:
         return self.path / "0.monitor.csv"
+
+    @property
+    def arguments_file(self) -> Path:
+        return self.config_file.with_name("args.yml")
 
     @property
     def config_file(self) -> Path:
@@ -99,16 +132,20 @@ class RunFolder:
         :param arguments: the resolved command line
         :param command: as it was typed
         """
-        versions = {"python": platform.python_version(), "sb3_kfcv": __version__} | {name: version(name) for name in LIBRARIES}
         texts = {
             "config.yml": _as_yaml(settings),
             "args.yml": _as_yaml(arguments),
             "command.txt": command + "\n",
-            "versions.json": json.dumps({**versions, "platform": platform.platform()}, indent=2) + "\n",
+            "versions.json": json.dumps({**library_versions(), "platform": platform.platform()}, indent=2) + "\n",
         }
         for name, text in texts.items():
             with atomic_write(self.config_file.with_name(name)) as file:
                 file.write(text.encode("utf-8"))
+
+    def versions_changed(self) -> list[str]:
+        """Libraries that have another version than when the run was begun, each as ``torch 2.12.0 → 2.13.0``."""
+        then, now = json.loads(self.config_file.with_name("versions.json").read_text()), library_versions()
+        return [f"{name} {then.get(name)} → {found}" for name, found in now.items() if then.get(name) != found]
 
 
 def file_name(env_id: str) -> str:
@@ -118,3 +155,20 @@ def file_name(env_id: str) -> str:
 
 def _as_yaml(values: Mapping[str, Any]) -> str:
     return yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True)
+
+
+def read_map(path: Path) -> dict[str, Any]:
+    """
+    A YAML file that holds a map.
+
+    :raises ValueError: if it is missing, no YAML, or something else
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is no valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{path} holds no map of settings")
+    return content

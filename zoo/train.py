@@ -26,10 +26,12 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import each other as the package ``zoo``
 
-from sb3_kfcv.common.callbacks import MultiAgentEvalCallback, PeriodicCheckpoint, StopOnSignal
+from sb3_kfcv.common.callbacks import MultiAgentEvalCallback, StopOnSignal
+from sb3_kfcv.common.checks import NonFiniteError
 from sb3_kfcv.common.naming import unknown_name
-from sb3_kfcv.common.normalization import load_normalization, save_model
 from sb3_kfcv.maddpg import MADDPG
+from sb3_kfcv.saving.checkpoints import Checkpoints, checkpoints_in
+from sb3_kfcv.saving.normalization import load_normalization
 from sb3_kfcv.vec_env.make import layout_of, make_vec_env, metric_names_of
 from zoo.hyperparams import (
     PRESETS,
@@ -40,11 +42,11 @@ from zoo.hyperparams import (
     load_entry,
     merged,
     parse_pairs,
-    read_map,
 )
-from zoo.run_folder import RunFolder, file_name
+from zoo.run_folder import RunFolder, file_name, read_map
 
 BAD_INPUT = 2  # exit status, as of argparse
+NOT_FINITE = 3  # a loss, reward, observation or action was infinite or NaN
 SIGNALLED = 128  # plus the number of the signal: 130 after Ctrl-C, 143 after SIGTERM
 
 # Worlds of the evaluation are seeded this far above those of the training, which are seed, seed + 1, …
@@ -53,11 +55,8 @@ EVAL_SEED_OFFSET = 1_000_000
 # Without --log-interval: log once per so many episodes of each world.
 EPISODES_PER_LOG = 4
 
-# Flags that a continued run takes over from the one it continues.
-CARRIED_FLAGS = (
-    *("log_folder", "tensorboard_log", "eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "log_interval"),
-    *("num_threads", "device", "verbose"),
-)
+# Flags that may stand beside --resume; all else is as the run was begun.
+FREE_WHEN_RESUMED = ("resume", "progress", "verbose")
 
 
 class Parser(argparse.ArgumentParser):
@@ -97,8 +96,19 @@ def make_parser() -> Parser:
     )
     add("--eval-episodes", type=int, default=20, help="episodes per evaluation (default: %(default)s)")
     add("--n-eval-envs", type=int, default=20, help="worlds that evaluate side by side (default: %(default)s)")
-    add("--save-freq", type=whole_number, default=-1, help="env steps between checkpoints, -1: none (default: %(default)s)")
-    add("--save-replay-buffer", action="store_true", help="save the replay buffer with every checkpoint and at the end")
+    add(
+        "--resume",
+        metavar="RUN_DIR",
+        help="go on with a stopped or killed run from its last checkpoint, bit for bit",
+    )
+    add(
+        "--save-freq",
+        type=whole_number,
+        default=25_000,
+        help="env steps between checkpoints, -1: only when stopped by a signal (default: %(default)s)",
+    )
+    add("--keep-checkpoints", type=int, default=3, help="how many of the latest are kept, -1: all (default: %(default)s)")
+    add("--save-replay-buffer", action="store_true", help="save the replay buffer at the end, for -i")
     add("--log-interval", type=int, default=-1, help=f"episodes between logs; -1: {EPISODES_PER_LOG} per world, -2: off")
     pairs: dict[str, Any] = {"nargs": "+", "action": "extend", "default": [], "metavar": "KEY:VALUE"}
     add("-params", "--hyperparams", **pairs, help="overwrite hyperparameters, such as gamma:0.95 policy_kwargs.n_critics:2")
@@ -106,7 +116,7 @@ def make_parser() -> Parser:
     add("--eval-env-kwargs", **pairs, help="settings of the evaluation's worlds where they differ")
     add("-conf", "--conf-file", help="YAML file of hyperparameters (default: hyperparams/<algo>.yml)")
     add("--preset", help=f"{' or '.join(PRESETS)}: what learns better in place of the paper's values")
-    add("-i", "--trained-agent", help="a saved model to continue, with the replay_buffer.npz beside it if there is one")
+    add("-i", "--trained-agent", help="a saved model to train on in a new run, with the replay_buffer.zip beside it if any")
     add("--team", help="learn only this group of agents")
     add("--opponents", **{**pairs, "metavar": "GROUP:NAME"}, help="scripted policy of each other group, such as sheep:flee")
     add("--num-threads", type=int, default=1, help="threads of PyTorch (default: %(default)s)")
@@ -143,7 +153,7 @@ class Training:
     :param hyperparams: the settings
     :param model: the learner
     :param eval_env: worlds of the evaluation; ``None`` without evaluations
-    :param n_timesteps: env steps still to go
+    :param n_timesteps: env steps to go, from the start or from the model of ``-i``
     """
 
     args: argparse.Namespace
@@ -201,6 +211,28 @@ def continue_as_begun(args: argparse.Namespace, model_path: Path) -> None:
             args.seed = begun["seed"] + 1
 
 
+def as_begun(args: argparse.Namespace, given: Sequence[str]) -> tuple[argparse.Namespace, RunFolder]:
+    """
+    The command line with which a run was begun.
+
+    :param args: the command line that resumes it
+    :param given: the names of the flags that are on it
+    :return: its command line, and its folder
+    :raises ValueError: if there is nothing to resume, or if the command line wants something else than that
+    """
+    for name in given:
+        if name not in FREE_WHEN_RESUMED:
+            flag = f"--{name.replace('_', '-')}"
+            raise ValueError(f"a resumed run keeps its settings: leave out {flag}, or train its model on with -i in a new run")
+    folder = RunFolder.existing(args.resume)
+    if folder.last_model.exists():
+        raise ValueError(f"the run in {folder.path} has ended; to train its model on: -i {folder.last_model} -n STEPS")
+    begun = argparse.Namespace(**{**vars(make_parser().parse_all([])), **read_map(folder.arguments_file)})
+    for name in ("resume", *(name for name in given if name in FREE_WHEN_RESUMED)):
+        setattr(begun, name, getattr(args, name))
+    return begun, folder
+
+
 def make_env(hyperparams: Hyperparams, n_envs: int, seed: int, env_kwargs: dict[str, Any], training: bool) -> VecEnv:
     """
     Worlds to train or to evaluate in.
@@ -237,15 +269,19 @@ def make_eval_env(args: argparse.Namespace, hyperparams: Hyperparams, env: VecEn
     return eval_env
 
 
-def build(args: argparse.Namespace) -> Training:
+def build(args: argparse.Namespace, resumed: RunFolder | None = None) -> Training:
     """
     Everything that can be refused, before anything is written.
 
+    :param args: the command line
+    :param resumed: the folder of the run, if it goes on
     :raises ValueError: one sentence that says what is wrong
     """
     if args.num_threads < 1:
         raise ValueError(f"--num-threads is {args.num_threads}; it must be at least 1")
-    hyperparams = resolve(args)
+    if args.keep_checkpoints == 0:
+        raise ValueError("--keep-checkpoints is 0; it must be at least 1, or -1 to keep all")
+    hyperparams = check(args.algo, args.env, read_map(resumed.config_file)) if resumed else resolve(args)
     th.set_num_threads(args.num_threads)
     if args.seed < 0:
         args.seed = int(np.random.default_rng().integers(2**31))
@@ -253,7 +289,7 @@ def build(args: argparse.Namespace) -> Training:
     eval_env = make_eval_env(args, hyperparams, env)
     algorithm = find_algorithm(args.algo)
     settings = {**hyperparams.model_kwargs(), "seed": args.seed, "device": args.device, "verbose": args.verbose}
-    if not args.trained_agent:
+    if not args.trained_agent or (resumed and checkpoints_in(resumed.path)):
         model = algorithm(hyperparams.policy, env, **settings)
         return Training(args, hyperparams, model, eval_env, hyperparams.n_timesteps)
 
@@ -263,19 +299,24 @@ def build(args: argparse.Namespace) -> Training:
     buffer_file = RunFolder.of_model(args.trained_agent, args.env).replay_buffer
     if buffer_file.exists():
         model.load_replay_buffer(buffer_file)
-    to_go = args.n_timesteps if args.n_timesteps > 0 else hyperparams.n_timesteps - model.num_timesteps
+    if resumed:
+        to_go = hyperparams.n_timesteps - model.num_timesteps
+    else:
+        to_go = args.n_timesteps if args.n_timesteps > 0 else hyperparams.n_timesteps - model.num_timesteps
     if to_go <= 0:
         raise ValueError(f"{args.trained_agent} has its {model.num_timesteps} env steps already; say with -n how many more")
     hyperparams.n_timesteps = model.num_timesteps + to_go
     return Training(args, hyperparams, model, eval_env, to_go)
 
 
-def make_callbacks(training: Training, folder: RunFolder) -> list[BaseCallback]:
-    """Evaluations and checkpoints, as the command line wants them."""
+def make_callbacks(training: Training, folder: RunFolder, stop: StopOnSignal) -> list[BaseCallback]:
+    """The stop, checkpoints and evaluations, as the command line wants them."""
     args = training.args
-    callbacks: list[BaseCallback] = []
-    if args.save_freq > 0:
-        callbacks.append(PeriodicCheckpoint(args.save_freq, folder.path, args.save_replay_buffer))
+    resume = args.resume is not None
+    callbacks: list[BaseCallback] = [
+        stop,
+        Checkpoints(folder.path, args.save_freq, args.keep_checkpoints, resume, stop, verbose=args.verbose),
+    ]
     if training.eval_env is not None:
         callbacks.append(
             MultiAgentEvalCallback(
@@ -296,10 +337,10 @@ def start_logs(training: Training, folder: RunFolder) -> None:
     while not isinstance(env, VecMonitor):
         env = env.venv
     env.info_keywords = metric_names_of(env)
-    env.results_writer = ResultsWriter(
-        str(folder.monitor_file), {"t_start": env.t_start, "env_id": folder.env_id}, env.info_keywords
-    )
     args = training.args
+    header: dict[str, float | str] = {"t_start": env.t_start, "env_id": folder.env_id}
+    going_on = args.resume is not None and bool(checkpoints_in(folder.path))
+    env.results_writer = ResultsWriter(str(folder.monitor_file), header, env.info_keywords, override_existing=not going_on)
     log_path = folder.path
     if args.tensorboard_log:
         log_path = Path(args.tensorboard_log) / file_name(args.env) / f"{args.algo}_{folder.number}"
@@ -317,7 +358,7 @@ def log_interval(args: argparse.Namespace, n_envs: int) -> int | None:
 
 def train(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseCallback] = ()) -> int:
     """
-    Train, and save the model whether the training ended or was stopped.
+    Train to the end, to a signal, or to a number that is not finite.
 
     :param training: what was built
     :param folder: where everything goes
@@ -326,24 +367,27 @@ def train(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseC
     """
     args, model = training.args, training.model
     with StopOnSignal() as stop:
+        callbacks = make_callbacks(training, folder, stop)
         try:
             model.learn(
                 training.n_timesteps,
-                [*make_callbacks(training, folder), *extra_callbacks, stop],
+                [*callbacks, *extra_callbacks],
                 log_interval(args, training.hyperparams.n_envs),  # type: ignore[arg-type]
-                reset_num_timesteps=not args.trained_agent,
+                reset_num_timesteps=model.num_timesteps == 0,
                 progress_bar=args.progress,
             )
         except KeyboardInterrupt:
-            stop.received = stop.received or StopOnSignal.SIGNALS[0]
-    save_model(model, folder.last_model)
-    if args.save_replay_buffer or stop.received:
+            return SIGNALLED + (stop.received or StopOnSignal.SIGNALS[0])
+        except NonFiniteError as error:
+            print(f"error: {error}; the training has stopped after {model.num_timesteps:,} env steps", file=sys.stderr)
+            return NOT_FINITE
+    if stop.received is not None:
+        return SIGNALLED + stop.received
+    model.save(folder.last_model)
+    if args.save_replay_buffer:
         model.save_replay_buffer(folder.replay_buffer)
-    if stop.received is None:
-        print(f"trained {model.num_timesteps:,} env steps; the model is {folder.last_model}")
-        return 0
-    print(f"stopped after {model.num_timesteps:,} env steps; to go on: {continuing_command(args, folder)}")
-    return SIGNALLED + stop.received
+    print(f"trained {model.num_timesteps:,} env steps; the model is {folder.last_model}")
+    return 0
 
 
 def interpreter() -> str:
@@ -352,18 +396,13 @@ def interpreter() -> str:
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
 
 
-def continuing_command(args: argparse.Namespace, folder: RunFolder) -> str:
-    """The command that continues a stopped run to the end that it had planned."""
-    parser = make_parser()
-    words = [interpreter(), "zoo/train.py", "--algo", args.algo, "--env", args.env, "-i", str(folder.last_model)]
-    for name in CARRIED_FLAGS:
-        value = getattr(args, name)
-        if value != parser.get_default(name):
-            words += [f"--{name.replace('_', '-')}", str(value)]
-    if args.eval_env_kwargs:
-        words += ["--eval-env-kwargs", *args.eval_env_kwargs]
-    words += ["--save-replay-buffer"] * args.save_replay_buffer + ["-P"] * args.progress
-    return shlex.join(words)
+def what_is_left(folder: RunFolder) -> str:
+    """What a run that did not come to its end leaves behind, and how it goes on."""
+    checkpoints = checkpoints_in(folder.path)
+    resume = shlex.join([interpreter(), "zoo/train.py", "--resume", str(folder.path)])
+    if not checkpoints:
+        return f"no checkpoint was saved yet; to start again: {resume}"
+    return f"the last checkpoint is of {max(checkpoints):,} env steps; to go on: {resume}"
 
 
 def main(argv: Sequence[str] | None = None, extra_callbacks: Sequence[BaseCallback] = ()) -> int:
@@ -372,26 +411,60 @@ def main(argv: Sequence[str] | None = None, extra_callbacks: Sequence[BaseCallba
 
     :param argv: the command line; by default that of the process
     :param extra_callbacks: for whoever starts a run from Python
-    :return: exit status
+    :return: exit status: 0, 2 for bad input, 3 for a number that is not finite, 130 after Ctrl-C, 143 after SIGTERM
     """
+    words = [interpreter(), "zoo/train.py", *(sys.argv[1:] if argv is None else argv)]
     try:
         args = make_parser().parse_all(argv)
+        if args.resume is not None:
+            return resume_run(args, extra_callbacks)
         training = build(args)
-    except (ValueError, gym.error.Error) as error:
+    except (ValueError, MemoryError, gym.error.Error) as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_INPUT
     try:
         folder = RunFolder.create(args.log_folder, args.algo, args.env)
-        start_logs(training, folder)
+        folder.describe(training.hyperparams.to_dict(), vars(args), shlex.join(words))
     except OSError as error:
         print(f"error: the run cannot write its files: {error}", file=sys.stderr)
         return BAD_INPUT
-    words = [interpreter(), "zoo/train.py", *(sys.argv[1:] if argv is None else argv)]
-    folder.describe(training.hyperparams.to_dict(), vars(args), shlex.join(words))
     print(f"{args.algo} on {args.env}, seed {args.seed}, in {folder.path}")
     if args.verbose > 0:
         print(yaml.safe_dump(training.hyperparams.to_dict(), sort_keys=False))
-    return train(training, folder, extra_callbacks)
+    with folder.locked():
+        return run(training, folder, extra_callbacks)
+
+
+def resume_run(args: argparse.Namespace, extra_callbacks: Sequence[BaseCallback]) -> int:
+    """
+    Go on with a run.
+
+    :param args: the command line
+    :param extra_callbacks: see :func:`main`
+    :return: exit status
+    :raises ValueError: if it cannot be
+    """
+    parser = make_parser()
+    given = [name for name, value in vars(args).items() if value != parser.get_default(name)]
+    begun, folder = as_begun(args, given)
+    with folder.locked():
+        changed = folder.versions_changed()
+        if changed:
+            print(
+                f"note: {', '.join(changed)} since the run was begun: it goes on, but perhaps not bit for bit", file=sys.stderr
+            )
+        training = build(begun, folder)
+        print(f"{begun.algo} on {begun.env}, seed {begun.seed}, goes on in {folder.path}")
+        return run(training, folder, extra_callbacks)
+
+
+def run(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseCallback]) -> int:
+    """Train, and say what is left if that did not come to its end."""
+    start_logs(training, folder)
+    status = train(training, folder, extra_callbacks)
+    if status:
+        print(f"stopped after {training.model.num_timesteps:,} env steps; {what_is_left(folder)}")
+    return status
 
 
 if __name__ == "__main__":

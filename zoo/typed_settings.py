@@ -9,16 +9,8 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import torch as th
-from torch import nn
-
 from sb3_kfcv.common.naming import unknown_name
-
-# Classes are given by name: a configuration runs no code.
-CLASSES: dict[type, dict[str, type]] = {
-    nn.Module: {"relu": nn.ReLU, "tanh": nn.Tanh, "elu": nn.ELU, "leaky_relu": nn.LeakyReLU, "gelu": nn.GELU, "silu": nn.SiLU},
-    th.optim.Optimizer: {"adam": th.optim.Adam, "adamw": th.optim.AdamW, "rmsprop": th.optim.RMSprop, "sgd": th.optim.SGD},
-}
+from sb3_kfcv.saving.values import classes_of
 
 
 def settings_of(callable_: Callable[..., Any], without: Sequence[str] = ()) -> dict[str, Any]:
@@ -75,7 +67,7 @@ def convert(value: Any, hint: Any) -> Any:
         return {convert(key, arguments[0]): convert(item, arguments[1]) for key, item in value.items()} if arguments else value
     if inspect.isclass(origin) and issubclass(origin, (Sequence, tuple)) and isinstance(value, (list, tuple)):
         return _sequence(value, origin, arguments)
-    if origin is type and isinstance(value, str) and value in CLASSES.get(arguments[0], {}):
+    if origin is type and isinstance(value, str) and value in classes_of(arguments[0]):
         return value
     raise TypeError
 
@@ -128,7 +120,7 @@ def describe(hint: Any) -> str:
     if origin in plain:
         return plain[origin]
     if origin is type:
-        return f"one of {', '.join(CLASSES.get(arguments[0], {}))}"
+        return f"one of {', '.join(classes_of(arguments[0]))}"
     if inspect.isclass(origin) and issubclass(origin, (Sequence, tuple)):
         inner = dict.fromkeys(_plural(describe(argument)) for argument in arguments if argument is not Ellipsis)
         return f"a list of {' and '.join(inner)}" if inner else "a list"
@@ -150,5 +142,5 @@ def resolve_classes(settings: Mapping[str, Any], hints: Mapping[str, Any]) -> di
     result = dict(settings)
     for name, value in settings.items():
         if typing.get_origin(hints[name]) is type:
-            result[name] = CLASSES[typing.get_args(hints[name])[0]][value]
+            result[name] = classes_of(typing.get_args(hints[name])[0])[value]
     return result

@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_kfcv.common.evaluation import evaluate, with_interval
-from sb3_kfcv.common.files import atomic_write
-from sb3_kfcv.common.normalization import save_model
+from sb3_kfcv.saving.files import atomic_write, going_on
 
 
 class MultiAgentEvalCallback(EventCallback):
@@ -64,7 +62,7 @@ class MultiAgentEvalCallback(EventCallback):
 
     def _on_training_start(self) -> None:
         self._next = _next_multiple(self.eval_freq, self.num_timesteps)
-        if self.eval_at_start:
+        if self.eval_at_start and self.num_timesteps == 0:
             self.evaluate()
 
     def _on_step(self) -> bool:
@@ -87,7 +85,8 @@ class MultiAgentEvalCallback(EventCallback):
         if self.last_mean_reward > self.best_mean_reward:
             self.best_mean_reward = self.last_mean_reward
             if self.best_model_save_path is not None:
-                save_model(self.model, self.best_model_save_path / "best_model.zip")
+                with going_on("the best model"):
+                    self.model.save(self.best_model_save_path / "best_model.zip")
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All evaluations so far, as in ``evaluations.npz``."""
@@ -99,7 +98,7 @@ class MultiAgentEvalCallback(EventCallback):
 
     def _write(self) -> None:
         if self.log_path is not None:
-            with atomic_write(self.log_path / "evaluations.npz") as file:
+            with going_on("evaluations.npz"), atomic_write(self.log_path / "evaluations.npz") as file:
                 np.savez(file, **self.arrays())  # type: ignore[arg-type]
 
     def _log(self, episodes: dict[str, np.ndarray]) -> None:
@@ -115,50 +114,11 @@ class MultiAgentEvalCallback(EventCallback):
             print(f"evaluation at {self.num_timesteps:,} env steps: reward {reward} (returns: {parts})")
 
 
-class PeriodicCheckpoint(BaseCallback):
-    """
-    Saves ``rl_model_<N>_steps.zip`` every so many env steps, between a training and the next rollout, where model and
-    replay buffer belong together.
-
-    :param save_freq: env steps between checkpoints
-    :param save_path: folder
-    :param save_replay_buffer: save ``rl_model_replay_buffer_<N>_steps.npz``, too
-    """
-
-    model: OffPolicyAlgorithm
-
-    def __init__(self, save_freq: int, save_path: str | Path, save_replay_buffer: bool = False) -> None:
-        super().__init__()
-        self.save_freq = save_freq
-        self.save_path = Path(save_path)
-        self.save_replay_buffer = save_replay_buffer
-
-    def _on_training_start(self) -> None:
-        self._next = _next_multiple(self.save_freq, self.num_timesteps)
-
-    def _on_rollout_start(self) -> None:
-        self._save_if_due()
-
-    def _on_training_end(self) -> None:
-        self._save_if_due()
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _save_if_due(self) -> None:
-        steps = self.model.num_timesteps
-        if steps < self._next:
-            return
-        self._next = _next_multiple(self.save_freq, steps)
-        save_model(self.model, self.save_path / f"rl_model_{steps}_steps.zip")
-        if self.save_replay_buffer:
-            self.model.save_replay_buffer(self.save_path / f"rl_model_replay_buffer_{steps}_steps.npz")
-
-
 class StopOnSignal(BaseCallback):
     """
-    Ends the training at the next step when the process is told to (Ctrl-C, SIGTERM), so that the model can be saved.
-    A second signal interrupts at once. Signals are caught between ``with`` and its end.
+    Ends the training when the process is told to (Ctrl-C, SIGTERM): the step in hand is finished, and the callbacks after
+    this one see ``ending`` at the start of a rollout, where a checkpoint can be saved. A second signal interrupts at once.
+    Signals are caught between ``with`` and its end.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -166,6 +126,14 @@ class StopOnSignal(BaseCallback):
     def __init__(self) -> None:
         super().__init__()
         self.received: int | None = None
+        self.ending = False
+
+    def get_state(self) -> dict[str, Any]:
+        """Nothing: a stop is not gone on with."""
+        return {}
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Inverse of :meth:`get_state`."""
 
     def __enter__(self) -> StopOnSignal:
         self._before = {number: signal.signal(number, self._receive) for number in self.SIGNALS}
@@ -180,8 +148,11 @@ class StopOnSignal(BaseCallback):
             raise KeyboardInterrupt
         self.received = number
 
+    def _on_rollout_start(self) -> None:
+        self.ending = self.received is not None
+
     def _on_step(self) -> bool:
-        return self.received is None
+        return not self.ending
 
 
 class TrainByTheClock(BaseCallback):
@@ -200,6 +171,14 @@ class TrainByTheClock(BaseCallback):
     def elapsed(self) -> float:
         """Seconds since the training started."""
         return time.monotonic() - self._start
+
+    def get_state(self) -> dict[str, Any]:
+        """The time that has passed."""
+        return {"elapsed": self.elapsed}
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Inverse of :meth:`get_state`."""
+        self._start = time.monotonic() - saved["elapsed"]
 
     def _on_training_start(self) -> None:
         self._start = time.monotonic()

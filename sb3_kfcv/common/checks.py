@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Integral, Real
 from typing import Any
+
+import numpy as np
 
 from sb3_kfcv.common.naming import unknown_name
 
@@ -35,6 +38,35 @@ def require_between(name: str, value: float, low: float, high: float = float("in
     if not low <= value <= high or (above and value == low):
         bounds = f"{'above' if above else 'at least'} {low:g}" + ("" if high == float("inf") else f" and at most {high:g}")
         raise ValueError(f"{name} must be {bounds}, got {value!r}")
+
+
+class NonFiniteError(ValueError):
+    """A number that ought to be finite is infinite or NaN; the message names it."""
+
+
+def require_finite(name: str, values: np.ndarray) -> None:
+    """
+    :param name: of the values
+    :param values: must be neither infinite nor NaN
+    :raises NonFiniteError: if one is
+    """
+    if values.dtype.kind == "f" and not (np.isfinite(values.min(initial=0)) and np.isfinite(values.max(initial=0))):
+        raise NonFiniteError(f"{name} must be finite, and holds {values[~np.isfinite(values)][0]}")
+
+
+def require_finite_columns(quantity: str, rows: np.ndarray, columns: Mapping[str, slice]) -> None:
+    """
+    The quick check of what passes at every step.
+
+    :param quantity: what the numbers are, such as ``"observation"``
+    :param rows: (…, columns)
+    :param columns: whose they are: name → where they stand
+    :raises NonFiniteError: names the owner and the quantity if a number is infinite or NaN
+    """
+    if math.isfinite(rows.sum()):  # a sum may also overflow: look closer
+        return
+    for name, where in columns.items():
+        require_finite(f"the {quantity} of {name}", rows[..., where])
 
 
 def require_parameters(name: str, given: Iterable[str], function: Callable[..., Any]) -> None:

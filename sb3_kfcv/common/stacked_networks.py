@@ -15,6 +15,8 @@ from itertools import pairwise
 import torch as th
 from torch import nn
 
+from sb3_kfcv.common.memory import require_memory
+
 
 class StackedLinear(nn.Module):
     """
@@ -81,6 +83,8 @@ class StackedMLP(nn.Module):
         self.input_per_member = n_inputs is None
         self.n_inputs = n_networks if n_inputs is None else n_inputs
         self.sizes = list(sizes)
+        n_weights = n_networks * sum(n_in * n_out for n_in, n_out in pairwise(sizes))
+        require_memory(f"a stack of {n_networks} networks {self.sizes}", 16 * n_weights)  # float32; gradient, two moments
         self.activation = activation_fn()
         self.first = StackedLinear(self.n_inputs, sizes[0], n_networks // self.n_inputs * sizes[1])
         self.rest = nn.ModuleList(StackedLinear(n_networks, n_in, n_out) for n_in, n_out in pairwise(sizes[1:]))

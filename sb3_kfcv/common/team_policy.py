@@ -101,6 +101,16 @@ class TeamPolicy:
                 filled[:, columns] = player.predict(rows, deterministic=deterministic)[0][:, columns]
         return filled.reshape(np.shape(actions))
 
+    def get_state(self) -> dict[str, Any]:
+        """The random generators of the scripted policies, by group."""
+        scripted = {group: player for group, player in self.players.items() if isinstance(player, ScriptedPolicy)}
+        return {group: player.rng.bit_generator.state for group, player in scripted.items()}
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Inverse of :meth:`get_state`."""
+        for group, state in saved.items():
+            self.players[group].rng.bit_generator.state = state  # type: ignore[union-attr]
+
     def _scripted_actions(self, policy: ScriptedPolicy, rows: np.ndarray) -> np.ndarray:
         """The group's actions, side by side (B, columns of the group)."""
         own = np.stack([rows[:, self.layout.obs_slices[i]] for i in policy.members], axis=1)  # (B, m, obs_size)

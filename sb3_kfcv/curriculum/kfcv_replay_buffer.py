@@ -283,25 +283,37 @@ class KFCVReplayBuffer(JointReplayBuffer):
         stats["curriculum/scores"] = th.as_tensor(self.scores[: self.n_rows])
         return stats
 
-    def state_arrays(self) -> dict[str, np.ndarray]:
-        clock = [self._updates_since_refresh, self._new_since_refresh, self.n_refreshes]
-        teachers = {f"teacher.{name}": value.cpu().numpy() for name, value in self.teachers.state_dict().items()}
-        rows = {"folds": self.folds, "scores": self.scores, "buckets": self.buckets}
-        return {**super().state_arrays(), **rows, "refresh_clock": np.array(clock), **teachers}
+    def state(self) -> dict[str, Any]:
+        return {
+            **super().state(),
+            **{"folds": self.folds, "scores": self.scores, "buckets": self.buckets},
+            "updates_since_refresh": self._updates_since_refresh,
+            "new_since_refresh": self._new_since_refresh,
+            "n_refreshes": self.n_refreshes,
+            "warned": self._warned,
+            "teachers": self.teachers.state_dict(),
+            "stats": self._stats,
+            "refresh_seconds": self._refresh_seconds,
+        }
 
-    def load_state_arrays(self, arrays: dict[str, np.ndarray]) -> None:
-        if "folds" in arrays and len(arrays["folds"]) != len(self.folds):
-            raise ValueError(f"not a replay buffer of this model: {len(arrays['folds'])} rows, here {len(self.folds)}")
-        super().load_state_arrays(arrays)
-        self.folds, self.scores, self.buckets = (arrays[name].copy() for name in ("folds", "scores", "buckets"))
-        self._updates_since_refresh, self._new_since_refresh, self.n_refreshes = (int(n) for n in arrays["refresh_clock"])
+    def _set_bookkeeping(self, state: dict[str, Any], rows: np.ndarray, own_rows: np.ndarray) -> None:
+        size = state["n_steps"] * state["n_envs"]
+        for name, low, high in (("folds", 0, self.n_folds), ("buckets", UNSCORED, self.n_folds), ("scores", -np.inf, np.inf)):
+            values = state[name]
+            alike = values.shape == (size,) and values.dtype == getattr(self, name).dtype
+            if not alike or not ((low <= values) & (values < high)).all():
+                raise ValueError(f"not a replay buffer of this model: its {name} are not those of its transitions")
+        for name in ("updates_since_refresh", "new_since_refresh", "n_refreshes"):
+            require_count(name, state[name], least=0)
+        self.teachers.load_state_dict(state["teachers"])
+        same = size == len(self.folds) and np.array_equal(rows, own_rows)
+        for name in ("folds", "scores", "buckets"):
+            values = getattr(self, name)
+            values[slice(None) if same else own_rows] = state[name][slice(None) if same else rows]
+        self._updates_since_refresh, self._new_since_refresh = state["updates_since_refresh"], state["new_since_refresh"]
+        self.n_refreshes, self._warned = state["n_refreshes"], bool(state["warned"])
         self._rows_of_bucket = None
-        self.teachers.load_state_dict(
-            {name.removeprefix("teacher."): th.as_tensor(array) for name, array in arrays.items() if "teacher." in name}
-        )
-
-    def _other_arrays(self) -> tuple[str, ...]:
-        return (*super()._other_arrays(), "folds", "scores", "buckets", "refresh_clock")
+        self._stats, self._refresh_seconds = dict(state["stats"]), float(state["refresh_seconds"])
 
 
 def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch as th
 
 from sb3_kfcv.common.stacked_networks import StackedMLP
+from sb3_kfcv.saving.parameters import check_network, check_optimizer
 
 
 class Teachers:
@@ -81,20 +83,17 @@ class Teachers:
             losses.append(per_teacher.detach().mean())
         return th.stack(losses[-max(steps // 10, 1) :]).mean().item()
 
-    def state_dict(self) -> dict[str, th.Tensor]:
-        """Networks and optimiser moments, by flat names."""
-        moments = self.optimizer.state_dict()["state"]
-        return {
-            **{f"network.{name}": value for name, value in self.stack.state_dict().items()},
-            **{f"adam.{i}.{name}": value for i, state in moments.items() for name, value in state.items()},
-        }
+    def state_dict(self) -> dict[str, Any]:
+        """Networks and optimiser moments."""
+        return {"network": self.stack.state_dict(), "optimizer": self.optimizer.state_dict()}
 
-    def load_state_dict(self, saved: dict[str, th.Tensor]) -> None:
-        """Inverse of :meth:`state_dict`."""
-        self.stack.load_state_dict({n.removeprefix("network."): v for n, v in saved.items() if n.startswith("network.")})
-        moments: dict[int, dict[str, th.Tensor]] = {}
-        for key, value in saved.items():
-            if key.startswith("adam."):
-                _, index, name = key.split(".")
-                moments.setdefault(int(index), {})[name] = value
-        self.optimizer.load_state_dict({**self.optimizer.state_dict(), "state": moments})
+    def load_state_dict(self, saved: dict[str, Any]) -> None:
+        """
+        Inverse of :meth:`state_dict`.
+
+        :raises ValueError: if these are other networks, or not finite
+        """
+        check_network(self.stack, saved["network"], "teachers/network")
+        moments = check_optimizer(self.optimizer, saved["optimizer"], "teachers/optimizer")
+        self.stack.load_state_dict(saved["network"])
+        self.optimizer.load_state_dict(moments)

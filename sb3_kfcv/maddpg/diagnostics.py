@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch as th
 
@@ -32,20 +32,23 @@ class Diagnostics:
         groups = [layout.groups[i] for i in agents]
         self._positions = {group: [p for p, g in enumerate(groups) if g == group] for group in dict.fromkeys(groups)}
         self._critic_losses: deque[th.Tensor] = deque(maxlen=WINDOW)  # each (agents,)
-        self._targets: deque[th.Tensor] = deque(maxlen=WINDOW)  # each (agents, batch)
+        self._targets: deque[th.Tensor] = deque(maxlen=WINDOW)  # each (agents,)
         self._actor_losses: deque[th.Tensor] = deque(maxlen=WINDOW)  # each (agents,)
         self._own_actions: list[th.Tensor] = []
+        self._norms: dict[str, float] = {}  # of networks whose gradients did not come along, see set_state
         self.update_seconds = 0.0
 
     def critics(self, losses: th.Tensor, targets: th.Tensor) -> None:
         """Note an update of the critics: losses (critics, agents), TD targets (agents, batch)."""
         self._critic_losses.append(losses.detach().mean(0))
-        self._targets.append(targets)
+        self._targets.append(targets.mean(-1))
+        self._norms.pop("critic", None)
 
     def actors(self, losses: th.Tensor, own_actions: list[th.Tensor]) -> None:
         """Note an update of the actors: losses (agents,), their actions per block (agents, batch, action)."""
         self._actor_losses.append(losses.detach())
         self._own_actions = [actions.detach() for actions in own_actions]
+        self._norms.pop("actor", None)
 
     def series(self, actor: StackedActors, critic: StackedCritics | OwnObservationCritics) -> dict[str, float]:
         """
@@ -57,15 +60,36 @@ class Diagnostics:
         values: dict[str, float] = {"time/update_seconds": self.update_seconds}
         if self._critic_losses:
             self._per_group(values, "train/critic_loss", th.stack(tuple(self._critic_losses)))
-            self._per_group(values, "train/q_target", th.stack(tuple(target.mean(-1) for target in self._targets)))
-            values["train/critic_grad_norm"] = _mean_norm(critic)
+            self._per_group(values, "train/q_target", th.stack(tuple(self._targets)))
+            values["train/critic_grad_norm"] = self._norms.get("critic") or _mean_norm(critic)
         if self._actor_losses:
             self._per_group(values, "train/actor_loss", th.stack(tuple(self._actor_losses)))
-            values["train/actor_grad_norm"] = _mean_norm(actor)
+            values["train/actor_grad_norm"] = self._norms.get("actor") or _mean_norm(actor)
             if self._continuous:
                 saturated = th.cat([(actions.abs() > SATURATED).float().flatten() for actions in self._own_actions])
                 values["train/action_saturation"] = saturated.mean().item()
         return values
+
+    def get_state(self, actor: StackedActors, critic: StackedCritics | OwnObservationCritics) -> dict[str, Any]:
+        """Everything that :meth:`series` will show, as plain values; the networks are those of :meth:`series`."""
+        logged = self.series(actor, critic)
+        return {
+            "critic_losses": list(self._critic_losses),
+            "targets": list(self._targets),
+            "actor_losses": list(self._actor_losses),
+            "own_actions": self._own_actions,
+            "norms": {n: logged[f"train/{n}_grad_norm"] for n in ("actor", "critic") if f"train/{n}_grad_norm" in logged},
+            "update_seconds": self.update_seconds,
+        }
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Inverse of :meth:`get_state`."""
+        for name in ("critic_losses", "targets", "actor_losses"):
+            own: deque[th.Tensor] = getattr(self, f"_{name}")
+            own.clear()
+            own.extend(saved[name])
+        self._own_actions, self._norms = list(saved["own_actions"]), dict(saved["norms"])
+        self.update_seconds = float(saved["update_seconds"])
 
     def _per_group(self, values: dict[str, float], key: str, stacked: th.Tensor) -> None:
         """Add the mean of ``stacked`` (time, agents) over all learning agents, and over each group where there are several."""

@@ -1,11 +1,9 @@
 from __future__ import annotations
 
-import io
-import pathlib
+import math
 import time
-import zipfile
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -13,16 +11,17 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, VectorizedActionNoise
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import polyak_update, safe_mean
+from stable_baselines3.common.utils import FloatSchedule, polyak_update, safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_kfcv.common.checks import require_between, require_count, require_parameters
-from sb3_kfcv.common.files import atomic_write, with_suffix
+from sb3_kfcv.common.checks import require_between, require_count, require_finite_columns, require_parameters
+from sb3_kfcv.common.memory import free_memory, in_words
 from sb3_kfcv.common.naming import unknown_name
+from sb3_kfcv.common.schedules import schedule_of
 from sb3_kfcv.common.team_policy import TeamPolicy
 from sb3_kfcv.maddpg.diagnostics import Diagnostics
 from sb3_kfcv.maddpg.policies import (
@@ -35,6 +34,7 @@ from sb3_kfcv.maddpg.policies import (
     by_agent,
 )
 from sb3_kfcv.replay import JointReplayBuffer, JointReplayBufferSamples
+from sb3_kfcv.saving.saveable import SaveableAlgorithm
 from sb3_kfcv.vec_env.make import layout_of, wrap_env
 
 SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
@@ -43,7 +43,7 @@ SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
 NOT_TENSORBOARD = ("stdout", "log", "json", "csv")
 
 
-class MADDPG(OffPolicyAlgorithm):
+class MADDPG(SaveableAlgorithm):
     """
     Multi-Agent Deep Deterministic Policy Gradient (Lowe et al. 2017; eq. 5–6 and Algorithm 1 of Lin et al. 2022).
 
@@ -55,7 +55,8 @@ class MADDPG(OffPolicyAlgorithm):
 
     :param policy: ``"MlpPolicy"`` or a subclass of :class:`MADDPGPolicy`
     :param env: a gym id such as ``"Grassland-v0"``, a PettingZoo ``ParallelEnv``, a joint env, or a ``VecEnv`` of such
-    :param learning_rate: of actors and critics; a number or a schedule of the remaining progress
+    :param learning_rate: of actors and critics; a number, ``"lin_1e-3"`` (falls linearly to 0), an SB3 schedule, or a
+        registered function of the remaining progress (see :func:`sb3_kfcv.register`)
     :param buffer_size: joint transitions held
     :param learning_starts: env steps with random actions before learning (Table 1 is silent; a fifth of its buffer)
     :param batch_size: joint transitions per update
@@ -107,7 +108,7 @@ class MADDPG(OffPolicyAlgorithm):
         self,
         policy: str | type[MADDPGPolicy],
         env: GymEnv | str | Any,
-        learning_rate: float | Schedule = 1e-3,
+        learning_rate: float | str | Schedule = 1e-3,
         buffer_size: int = 5000,
         learning_starts: int = 1000,
         batch_size: int = 128,
@@ -142,7 +143,7 @@ class MADDPG(OffPolicyAlgorithm):
         super().__init__(
             policy,
             env,
-            learning_rate,
+            learning_rate,  # type: ignore[arg-type]
             buffer_size,
             learning_starts,
             batch_size,
@@ -176,7 +177,7 @@ class MADDPG(OffPolicyAlgorithm):
         self.reward_scale = reward_scale
         self.actor_regularization = actor_regularization
         self.gumbel_temperature = gumbel_temperature
-        self._algorithm = type(self).__name__
+        self._episode_metrics: deque[dict[str, float]] = deque(maxlen=stats_window_size)
         if self.env is not None:
             self.layout = layout_of(self.env)
 
@@ -215,8 +216,16 @@ class MADDPG(OffPolicyAlgorithm):
         seen = layout.state_size if self._teachers_see_state else sum(layout.obs_sizes)
         self.teacher_input_size = seen + sum(layout.action_sizes)
         self._watch = Diagnostics(layout, self.agents)
-        self._episode_metrics: deque[dict[str, float]] = deque(maxlen=self._stats_window_size)
         self.replay_buffer.attach(self)
+        if self.verbose > 0:
+            held = (
+                f"{self.replay_buffer.buffer_size * self.n_envs:,} joint transitions, {in_words(self.replay_buffer.n_bytes)}"
+            )
+            print(f"Replay buffer: {held} ({in_words(free_memory())} of memory are free)")
+
+    def _setup_lr_schedule(self) -> None:
+        rate: Any = self.learning_rate
+        self.lr_schedule = FloatSchedule(schedule_of(rate) if isinstance(rate, str) else rate)
 
     def _check_settings(self) -> None:
         """Refuse what cannot train, before anything is built."""
@@ -232,6 +241,8 @@ class MADDPG(OffPolicyAlgorithm):
         require_count("train_freq", self.train_freq[0] if isinstance(self.train_freq, tuple) else self.train_freq)
         require_parameters("policy_kwargs", self.policy_kwargs, self.policy_class)
         require_parameters("replay_buffer_kwargs", self.replay_buffer_kwargs, self.replay_buffer_class)  # type: ignore[arg-type]
+        if isinstance(self.learning_rate, str):
+            schedule_of(self.learning_rate)
         require_between("reward_scale", self.reward_scale, 0, above=True)
         require_between("gamma", self.gamma, 0, 1)
         require_between("tau", self.tau, 0, 1)
@@ -288,12 +299,14 @@ class MADDPG(OffPolicyAlgorithm):
             targets = self.td_target(batch)  # (agents, batch)
             errors = targets - self.critic(inputs)  # (critics, agents, batch)
             critic_losses = live_mean(errors.square() * batch.weights, live)  # (critics, agents)
+            self._check_losses("critic loss", critic_losses.sum(0))
             self._minimise(self.critic, critic_losses.sum())
 
             # Eq. 6: ascend Q(s, a_1 … π_i(o_i) … a_N)
             if self._n_updates % self.policy_delay == 0:
                 own_actions, raw = self.actor.relaxed(batch.observations, self.gumbel_temperature)
                 actor_losses = -live_mean(self.critic.with_own_actions(inputs, own_actions), live)  # (agents,)
+                self._check_losses("actor loss", actor_losses)
                 sizes = by_agent(self.actor.blocks, [output.square().mean(-1) for output in raw])  # (agents, batch)
                 penalty = self.actor_regularization * live_mean(sizes, live).sum()
                 self._minimise(self.actor, actor_losses.sum() + penalty)
@@ -363,6 +376,15 @@ class MADDPG(OffPolicyAlgorithm):
             actions = self.policy.encode(th.as_tensor(self.policy.from_env(others), device=self.device))
         return actions
 
+    def _check_losses(self, quantity: str, losses: th.Tensor) -> None:
+        """
+        :raises NonFiniteError: names the learning agent whose loss, of (agents,), is not finite; no network has changed
+        """
+        if not th.isfinite(losses.sum()):
+            names = [self.layout.agents[i] for i in self.agents]
+            columns = {name: slice(i, i + 1) for i, name in enumerate(names)}
+            require_finite_columns(f"{quantity} in update {self._n_updates:,}", losses.detach().cpu().numpy(), columns)
+
     def _minimise(self, networks: StackedActors | StackedCritics | OwnObservationCritics, loss: th.Tensor) -> None:
         networks.optimizer.zero_grad()
         loss.backward()
@@ -412,7 +434,35 @@ class MADDPG(OffPolicyAlgorithm):
         if self._opponent_policy is not None:  # neither the warm-up nor the noise is for the opponents
             action = self._opponent_policy.fill(action, np.asarray(self._last_obs), deterministic=False)
             buffer_action = self.policy.from_env(action)
+        if not self.layout.discrete:
+            require_finite_columns("action", action, self._columns_of(self.layout.action_slices))
         return action, buffer_action
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        As in SB3, after a look at what came from the worlds.
+
+        :raises NonFiniteError: names the agent whose observation or reward is not finite
+        """
+        columns = self._columns_of(self.layout.obs_slices)
+        require_finite_columns("observation", np.asarray(new_obs), columns)
+        for world in np.flatnonzero(dones):
+            require_finite_columns("last observation", np.asarray(infos[world]["terminal_observation"]), columns)
+        if not math.isfinite(reward.sum()):
+            rewards = np.array([info["agent_rewards"] for info in infos])
+            require_finite_columns("reward", rewards, {name: slice(i, i + 1) for i, name in enumerate(self.layout.agents)})
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
+
+    def _columns_of(self, slices: Sequence[slice]) -> dict[str, slice]:
+        return dict(zip(self.layout.agents, slices, strict=True))
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         super()._update_info_buffer(infos, dones)
@@ -476,86 +526,27 @@ class MADDPG(OffPolicyAlgorithm):
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
         return OffPolicyAlgorithm._wrap_env(wrap_env(env, monitor_wrapper), verbose, monitor_wrapper)
 
-    @classmethod
-    def load(  # type: ignore[override]
-        cls: type[SelfMADDPG], path: str | pathlib.Path | io.BufferedIOBase, env: Any = None, **kwargs: Any
-    ) -> SelfMADDPG:
-        """
-        Load a model, as in SB3; ``env`` may be anything that the constructor takes.
+    def training_state(self) -> dict[str, Any]:
+        opponents = self._opponent_policy.get_state() if self._opponent_policy is not None else {}
+        return {"watch": self._watch.get_state(self.actor, self.critic), "opponents": opponents}
 
-        :param path: of the zip file
-        :param env: the world to go on in; ``None`` if only predictions are wanted
-        :param kwargs: see ``BaseAlgorithm.load``; other names replace saved settings, such as ``opponents``
-        :raises ValueError: if the env's agents are not those that the model was trained for
-        """
-        env = None if env is None else cls._wrap_env(maybe_make_env(env, 0), 0)
-        try:
-            model = super().load(path, env, **kwargs)
-        except (AssertionError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path} is no model file, or it is damaged: {error}") from None
-        except ValueError as error:
-            if env is not None and "spaces do not match" in str(error):
-                raise ValueError(f"the model in {path} is for another world than {layout_of(env)}: {error}") from None
-            if "zip-file" in str(error):
-                raise ValueError(f"{path} is no model file, or it is damaged: {error}") from None
-            raise
-        if env is not None and layout_of(env) != model.layout:
-            raise ValueError(f"the model in {path} is for {model.layout}; the env has {layout_of(env)}")
-        if model._algorithm != cls.__name__:
-            raise ValueError(f"the model in {path} was saved by {model._algorithm}; load it with {model._algorithm}.load")
-        if isinstance(model.action_noise, VectorizedActionNoise):  # made anew by learn() for the env's number of worlds
-            model.action_noise = model.action_noise.base_noise
-        return model
-
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """
-        Save the model, as in SB3, but never half: the file appears when it is whole, and an older one stays until then.
-
-        :param path: of the zip file (the ending is added), or an open file
-        :param exclude: names of attributes to leave out
-        :param include: names of attributes to keep that are left out by default
-        """
-        if isinstance(path, (str, pathlib.Path)):
-            with atomic_write(with_suffix(path, ".zip")) as file:
-                super().save(file, exclude, include)  # type: ignore[arg-type]
-        else:
-            super().save(path, exclude, include)
-
-    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """
-        Save the replay buffer as an ``.npz`` of plain arrays.
-
-        :param path: of the file (the ending is added), or an open file
-        """
-        if isinstance(path, (str, pathlib.Path)):
-            with atomic_write(with_suffix(path, ".npz")) as file:
-                np.savez(file, **self.replay_buffer.state_arrays())  # type: ignore[arg-type]
-        else:
-            np.savez(path, **self.replay_buffer.state_arrays())  # type: ignore[arg-type]
-
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """
-        Fill the replay buffer from a file of :meth:`save_replay_buffer`.
-
-        :param path: of the file (the ending is added), or an open file
-        :param truncate_last_traj: not used
-        :raises ValueError: if the file is of another buffer
-        """
-        source = with_suffix(path, ".npz") if isinstance(path, (str, pathlib.Path)) else path
-        try:
-            with np.load(source, allow_pickle=False) as file:
-                arrays = dict(file)
-        except (EOFError, ValueError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{path} is no replay buffer file, or it is damaged: {error}") from None
-        self.replay_buffer.load_state_arrays(arrays)
+    def set_training_state(self, saved: dict[str, Any]) -> None:
+        self._watch.set_state(saved["watch"])
+        if self._opponent_policy is not None:
+            self._opponent_policy.set_state(saved["opponents"])
 
     def _excluded_save_params(self) -> list[str]:
-        excluded = ["actor", "actor_target", "critic", "critic_target", "_watch", "_opponent_policy"]
+        excluded = [
+            "actor",
+            "actor_target",
+            "critic",
+            "critic_target",
+            "_watch",
+            "_opponent_policy",
+            "lr_schedule",
+            "start_time",
+        ]
+        excluded += ["agents", "n_learning_agents", "_agent_of_column", "teacher_input_size"]  # made anew of the settings
         if any(not isinstance(player, str) for player in (self.opponents or {}).values()):
             excluded.append("opponents")  # models are saved in their own files and given again to load()
         return super()._excluded_save_params() + excluded

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.preprocessing import get_action_dim, get_flattened_obs_dim
 from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_kfcv.common.checks import require_between, require_count, require_finite
+from sb3_kfcv.common.memory import require_memory
+
+# The arrays of stored transitions: (steps, n_envs, …).
+TRANSITION_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "alive", "states", "next_states")
 
 
 class JointReplayBufferSamples(NamedTuple):
@@ -87,6 +93,8 @@ class JointReplayBuffer(ReplayBuffer):
     ) -> None:
         if optimize_memory_usage:
             raise ValueError("optimize_memory_usage=True is not supported: time limits need the stored next observation")
+        self.n_bytes = n_bytes(buffer_size, observation_space, action_space, n_envs, n_agents, state_size)
+        require_memory(f"a replay buffer of {buffer_size:,} joint transitions", self.n_bytes)
         super().__init__(buffer_size, observation_space, action_space, device, n_envs)
         del self.timeouts  # time limits are told from deaths per agent, see ``agent_terminated``
         shape = (self.buffer_size, self.n_envs)
@@ -96,6 +104,7 @@ class JointReplayBuffer(ReplayBuffer):
         self.states = np.zeros((*shape, state_size), dtype=np.float32)
         self.next_states = np.zeros((*shape, state_size), dtype=np.float32)
         self.rng = np.random.default_rng(seed)
+        self.n_added = 0  # steps (of all worlds) ever stored
         self.progress = 0.0  # share of training done, in [0, 1]; set by the learner
         self.normalizer: VecNormalize | None = None
 
@@ -103,6 +112,11 @@ class JointReplayBuffer(ReplayBuffer):
     def n_rows(self) -> int:
         """Number of joint transitions held."""
         return self.size() * self.n_envs
+
+    def reset(self) -> None:
+        """Forget all transitions."""
+        super().reset()
+        self.n_added = 0
 
     def attach(self, student: Student) -> None:
         """Meet the learner. Uniform replay asks nothing of it."""
@@ -134,7 +148,8 @@ class JointReplayBuffer(ReplayBuffer):
         self.observations[pos] = obs
         self.next_observations[pos] = next_obs
         self.actions[pos] = np.reshape(action, (self.n_envs, self.action_dim))
-        self.pos = (pos + 1) % self.buffer_size
+        self.n_added += 1
+        self.pos = self.n_added % self.buffer_size
         self.full = self.full or self.pos == 0
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> JointReplayBufferSamples:  # type: ignore[override]
@@ -191,42 +206,90 @@ class JointReplayBuffer(ReplayBuffer):
         """What to log: name → scalar, or a tensor for a histogram."""
         return {}
 
-    def state_arrays(self) -> dict[str, np.ndarray]:
-        """Everything that the buffer holds, as plain arrays."""
-        size = self.size()
+    def state(self) -> dict[str, Any]:
+        """Everything but the transitions themselves, see :meth:`transitions`: what changes after a transition was stored."""
         return {
-            **{name: getattr(self, name)[:size] for name in self._row_arrays()},
-            "position": np.array([self.pos, self.full]),
-            "rng": np.array(json.dumps(self.rng.bit_generator.state)),
+            "n_steps": self.buffer_size,
+            "n_envs": self.n_envs,
+            "n_added": self.n_added,
+            "rng": self.rng.bit_generator.state,
+            "progress": self.progress,
         }
 
-    def load_state_arrays(self, arrays: dict[str, np.ndarray]) -> None:
+    def transitions(self, first: int = 0) -> dict[str, np.ndarray]:
         """
-        Inverse of :meth:`state_arrays`.
+        The stored transitions from a step on, the oldest first; they never change while they are held.
 
-        :raises ValueError: if the arrays are those of another buffer
+        :param first: number of the step, counted from the first ever added; those no longer held are left out
+        :return: name → (steps, n_envs, …)
         """
-        missing = [name for name in (*self._row_arrays(), *self._other_arrays()) if name not in arrays]
-        if missing:
-            raise ValueError(f"not a replay buffer of this model: it lacks {', '.join(missing)}")
-        for name in self._row_arrays():
-            given, own = arrays[name].shape, getattr(self, name).shape
-            if given[1] != self.n_envs:
-                raise ValueError(f"not a replay buffer of this model: it is of {given[1]} worlds, here {self.n_envs}")
-            if given[2:] != own[2:] or given[0] > own[0]:
-                raise ValueError(f"not a replay buffer of this model: {name!r} is {given}, here at most {own}")
-        for name in self._row_arrays():
-            getattr(self, name)[: len(arrays[name])] = arrays[name]
-        position, full = (int(value) for value in arrays["position"])
-        held = len(arrays["rewards"])
-        self.full = bool(full) and held == self.buffer_size
-        self.pos = position if self.full or not full else held % self.buffer_size
-        self.rng.bit_generator.state = json.loads(str(arrays["rng"]))
+        slots = np.arange(max(first, self.n_added - self.size()), self.n_added) % self.buffer_size
+        return {name: getattr(self, name)[slots] for name in TRANSITION_ARRAYS}
 
-    def _row_arrays(self) -> tuple[str, ...]:
-        """Names of the arrays whose first axis is time."""
-        return ("observations", "next_observations", "actions", "rewards", "dones", "alive", "states", "next_states")
+    def set_state(self, state: dict[str, Any], transitions: dict[str, np.ndarray]) -> None:
+        """
+        Go on exactly where :meth:`state` and :meth:`transitions` were called. With another size or another number of
+        worlds the latest transitions are kept, as many as fill whole steps, and the order of the draws is another.
 
-    def _other_arrays(self) -> tuple[str, ...]:
-        """Names of the other arrays that a saved buffer must have."""
-        return ("position", "rng")
+        :raises ValueError: if they are those of another buffer
+        """
+        expected = set(self.state())
+        if set(state) != expected:
+            odd = ", ".join(sorted(set(state) ^ expected))
+            raise ValueError(f"not a replay buffer of this model: {odd} differ")
+        n_steps, n_envs, n_added = (state[name] for name in ("n_steps", "n_envs", "n_added"))
+        for name, value in (("n_steps", n_steps), ("n_envs", n_envs), ("n_added", n_added)):
+            require_count(name, value, least=0 if name == "n_added" else 1)
+        held = min(n_added, n_steps)
+        n_rows = held * n_envs
+        self._check_transitions(transitions, held, n_envs)
+        rows = (np.arange(n_added - held, n_added)[:, None] % n_steps * n_envs + np.arange(n_envs)).ravel()  # the oldest first
+        if (n_steps, n_envs) == (self.buffer_size, self.n_envs):
+            n_added = int(n_added)
+        else:
+            n_added = held = min(held * n_envs // self.n_envs, self.buffer_size)
+            rows = rows[len(rows) - held * self.n_envs :]
+        slots = np.arange(n_added - held, n_added) % self.buffer_size
+        require_between("progress", state["progress"], 0, 1)
+        self._set_bookkeeping(state, rows, (slots[:, None] * self.n_envs + np.arange(self.n_envs)).ravel())
+        self.rng.bit_generator.state = state["rng"]
+        self.progress = state["progress"]
+        for name in TRANSITION_ARRAYS:
+            own = getattr(self, name)
+            latest = transitions[name].reshape(n_rows, own.shape[-1])[n_rows - len(rows) :]
+            own[slots] = latest.reshape(held, *own.shape[1:])
+        self.n_added, self.pos, self.full = n_added, n_added % self.buffer_size, n_added >= self.buffer_size
+
+    def _set_bookkeeping(self, state: dict[str, Any], rows: np.ndarray, own_rows: np.ndarray) -> None:
+        """
+        Take over what a kind of replay notes of each row.
+
+        :param state: as :meth:`state` gave it
+        :param rows: its rows, the oldest first
+        :param own_rows: where they lie now
+        """
+
+    def _check_transitions(self, transitions: dict[str, np.ndarray], held: int, n_envs: int) -> None:
+        """
+        :raises ValueError: unless they are ``held`` steps of ``n_envs`` worlds like this one's, all finite
+        """
+        if set(transitions) != set(TRANSITION_ARRAYS):
+            raise ValueError(f"not a replay buffer of this model: it has {', '.join(transitions)}")
+        for name, array in transitions.items():
+            expected = (held, n_envs, *getattr(self, name).shape[2:])
+            if array.shape != expected or array.dtype != getattr(self, name).dtype:
+                raise ValueError(
+                    f"not a replay buffer of this model: {name} is {array.shape} of {array.dtype}, wanted is {expected} "
+                    f"of {getattr(self, name).dtype}"
+                )
+            require_finite(f"{name} of the replay buffer", array)
+
+
+def n_bytes(
+    buffer_size: int, observation_space: spaces.Space, action_space: spaces.Space, n_envs: int, n_agents: int, state_size: int
+) -> int:
+    """Memory that the transitions of a :class:`JointReplayBuffer` take; its parameters."""
+    numbers = 2 * get_flattened_obs_dim(observation_space) + get_action_dim(action_space) + 3 * n_agents + 2 * state_size
+    itemsize = 4 if isinstance(action_space, spaces.Box) else 8
+    other = (itemsize - 4) * get_action_dim(action_space)
+    return max(buffer_size // n_envs, 1) * n_envs * (4 * numbers + other)

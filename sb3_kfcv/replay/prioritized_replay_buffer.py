@@ -95,16 +95,24 @@ class PrioritizedReplayBuffer(JointReplayBuffer):
             stats["per/td_errors"] = th.as_tensor(known)
         return stats
 
-    def state_arrays(self) -> dict[str, np.ndarray]:
-        ranks = {"by_rank": self._by_rank, "draws_since_sort": np.array(self._draws_since_sort)}
-        return {**super().state_arrays(), "td_errors": self.td_errors[: self.n_rows], **ranks}
+    def state(self) -> dict[str, Any]:
+        replayed = self.td_errors[: self.n_rows]
+        return {
+            **super().state(),
+            "td_errors": replayed,
+            "by_rank": self._by_rank,
+            "draws_since_sort": self._draws_since_sort,
+        }
 
-    def load_state_arrays(self, arrays: dict[str, np.ndarray]) -> None:
-        super().load_state_arrays(arrays)
+    def _set_bookkeeping(self, state: dict[str, Any], rows: np.ndarray, own_rows: np.ndarray) -> None:
+        td_errors, by_rank = state["td_errors"], state["by_rank"]
+        if td_errors.shape != (state["n_envs"] * min(state["n_steps"], state["n_added"]),) or not (td_errors >= 0).all():
+            raise ValueError("not a replay buffer of this model: its td_errors are no |δ| of its transitions")
+        is_order = by_rank.dtype == np.int64 and np.array_equal(np.sort(by_rank), np.arange(len(by_rank)))
+        if not is_order or len(by_rank) > len(td_errors):
+            raise ValueError("not a replay buffer of this model: its by_rank is no order of its transitions")
+        require_count("draws_since_sort", state["draws_since_sort"], least=0)
         self.td_errors[:] = np.inf
-        self.td_errors[: self.n_rows] = arrays["td_errors"][: self.n_rows]
-        self._by_rank = arrays["by_rank"].copy()
-        self._draws_since_sort = int(arrays["draws_since_sort"])
-
-    def _other_arrays(self) -> tuple[str, ...]:
-        return (*super()._other_arrays(), "td_errors", "by_rank", "draws_since_sort")
+        self.td_errors[own_rows] = td_errors[rows]
+        self._by_rank = by_rank if np.array_equal(rows, own_rows) else np.empty(0, dtype=np.int64)
+        self._draws_since_sort = state["draws_since_sort"]

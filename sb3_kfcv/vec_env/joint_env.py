@@ -92,6 +92,20 @@ class JointEnv(gym.Env):
     def close(self) -> None:
         self.parallel_env.close()
 
+    def get_state(self) -> dict[str, Any]:
+        """
+        Everything that the world and its episode are made of, as plain values; see :meth:`set_state`.
+
+        :raises AttributeError: if the parallel env has no ``get_state()``
+        """
+        state = {"returns": self._returns.copy(), "gone": self._gone.copy(), "state": self._state}
+        return {**state, "world": self.parallel_env.get_state()}  # type: ignore[attr-defined]
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Continue exactly where :meth:`get_state` was called."""
+        self._returns[:], self._gone[:], self._state = saved["returns"], saved["gone"], saved["state"]
+        self.parallel_env.set_state(saved["world"])  # type: ignore[attr-defined]
+
     def _join(self, observations: dict[str, np.ndarray]) -> np.ndarray:
         row = np.zeros(sum(self.layout.obs_sizes), dtype=np.float32)
         for agent, columns, gone in zip(self.layout.agents, self.layout.obs_slices, self._gone, strict=True):
