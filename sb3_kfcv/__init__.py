@@ -9,6 +9,7 @@ from sb3_kfcv.maddpg import MADDPG, MlpPolicy
 from sb3_kfcv.per_maddpg import PERMADDPG
 from sb3_kfcv.replay import JointReplayBuffer, PrioritizedReplayBuffer
 from sb3_kfcv.saving import FileFormatError, register
+from sb3_kfcv.saving.checkpoints import Checkpoints
 from sb3_kfcv.vec_env import JointEnv, ParticleVecEnv, make_vec_env
 from sb3_kfcv.vec_env.make import WORLDS
 from sb3_kfcv.version import __version__
@@ -28,6 +29,7 @@ __all__ = [
     "KFCVMADDPG",
     "MADDPG",
     "PERMADDPG",
+    "Checkpoints",
     "FileFormatError",
     "JointEnv",
     "KFCVReplayBuffer",

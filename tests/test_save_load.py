@@ -285,3 +285,14 @@ def test_a_truncated_model_is_refused_by_the_files_name(tmp_path):
     (tmp_path / "model.zip").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ValueError, match="model"):
         MADDPG.load(tmp_path / "model", env=toy())
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"critic_input": "state", "policy_kwargs": {"net_arch": [8], "n_critics": 2}}], ids=["plain", "twin"]
+)
+def test_a_policy_alone_comes_back(settings, tmp_path):
+    model = make(**settings).learn(40)
+    model.policy.save(tmp_path / "policy.zip")
+    policy = type(model.policy).load(tmp_path / "policy.zip", device="cpu")
+    assert_same_parameters(model.policy.state_dict(), policy.state_dict())
+    np.testing.assert_array_equal(model.predict(ROWS, deterministic=True)[0], policy.predict(ROWS, deterministic=True)[0])

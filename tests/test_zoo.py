@@ -89,7 +89,8 @@ def test_a_run_leaves_everything_in_its_folder(tmp_path, algo, env):
 
     run = run_folder(tmp_path, env, algo)
     files = {path.name for path in run.path.iterdir() if not path.name.startswith("events.out")}
-    expected = {f"{env}.zip", env, "best_model.zip", "rl_model_60_steps.zip", "transitions", "replay_buffer.zip"}
+    expected = {f"{env}.zip", env, "best_model.zip", "transitions", "replay_buffer.zip"}
+    expected |= {"rl_model_60_steps.zip", "rl_model_120_steps.zip"}
     assert files == expected | {"evaluations.npz", "0.monitor.csv", ".lock"}
 
     settings = {path.name for path in run.config_file.parent.iterdir()}

@@ -225,6 +225,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     measure = Measure(clock, MEASUREMENTS, env)
     status = train(training, run, [clock, measure])
     if status:
+        print("the demo was stopped")
         return status
 
     save_arrays(folder / "learning_curve.npz", measure.arrays())

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
+import pathlib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
@@ -11,12 +13,16 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import get_actor_critic_arch
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.common.utils import ConstantSchedule, get_device
 from torch import nn
 from torch.nn import functional as F
 
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.stacked_networks import StackedMLP
+from sb3_kfcv.saving.archive import open_archive, write_archive
+from sb3_kfcv.saving.parameters import check_network
+from sb3_kfcv.saving.saveable import refusals
 
 
 class Block:
@@ -336,6 +342,9 @@ def ego_order(layout: AgentLayout, agents: Sequence[int], critic_input: str) -> 
     return order
 
 
+SelfMADDPGPolicy = TypeVar("SelfMADDPGPolicy", bound="MADDPGPolicy")
+
+
 class MADDPGPolicy(BasePolicy):
     """
     Policy of MADDPG: actors, centralised critics, and the target networks of both.
@@ -489,8 +498,36 @@ class MADDPGPolicy(BasePolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
-        data.update(self._own_parameters, lr_schedule=self._dummy_schedule)
+        data.update(self._own_parameters, lr_schedule=ConstantSchedule(0.0))  # a policy alone does not learn
         return data
+
+    def save(self, path: str | pathlib.Path) -> None:
+        """
+        Save the policy alone, without optimisers: actors, critics and targets.
+
+        :param path: of the file
+        """
+        names = inspect.signature(type(self)).parameters
+        constructor = {name: value for name, value in self._get_constructor_parameters().items() if name in names}
+        write_archive(path, "policy", {"constructor": constructor, "parameters": self.state_dict()})
+
+    @classmethod
+    def load(cls: type[SelfMADDPGPolicy], path: str | pathlib.Path, device: th.device | str = "auto") -> SelfMADDPGPolicy:
+        """
+        Load a policy; nothing of the file is run.
+
+        :param path: of a file of :meth:`save`
+        :param device: where it goes
+        :raises FileFormatError: if the file is damaged, or none of these
+        """
+        with open_archive(path, "policy") as archive:
+            with refusals(archive, "constructor"):
+                policy = cls(**archive.read("constructor"))
+            with refusals(archive, "parameters"):
+                parameters = archive.read("parameters")
+                check_network(policy, parameters, "parameters")
+                policy.load_state_dict(parameters)
+        return policy.to(get_device(device))
 
 
 def gumbel_perturbed(logits: th.Tensor) -> th.Tensor:

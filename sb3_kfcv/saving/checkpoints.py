@@ -35,7 +35,7 @@ from sb3_kfcv.saving.run_state import (
     set_random_state,
 )
 from sb3_kfcv.saving.saveable import SaveableAlgorithm, refusals
-from sb3_kfcv.saving.values import encode
+from sb3_kfcv.saving.values import check_writable, encode
 
 NAME = re.compile(r"rl_model_(\d+)_steps\.zip")
 
@@ -182,6 +182,7 @@ class Checkpoints(BaseCallback):
         self._pieces: list[Piece] = []
         self._pieces_of: dict[Path, list[Piece]] = {}  # of checkpoints known to be whole
         self._resumed: Checkpoint | None = None
+        self._mid_rollout = False
 
     def get_state(self) -> dict[str, Any]:
         """What must not be lost: when the next checkpoint is due."""
@@ -195,7 +196,7 @@ class Checkpoints(BaseCallback):
 
     def _on_training_start(self) -> None:
         try:
-            env_state(self.training_env)
+            check_writable({"the state of the worlds": env_state(self.training_env)})
         except UnreadableEnvError as unreadable:
             warnings.warn(
                 f"the state of {unreadable} cannot be read: a resumed training starts new episodes; everything else is exact"
@@ -206,6 +207,12 @@ class Checkpoints(BaseCallback):
             self.num_timesteps = self.model.num_timesteps
             if self.verbose:
                 print(f"going on after {self.num_timesteps:,} env steps, from {self._resumed.path}")
+        steps = max(checkpoints_in(self.folder), default=0)
+        if steps > self.num_timesteps:
+            raise ValueError(
+                f"{self.folder} holds a checkpoint of {steps:,} env steps, of another training: go on with it by resume=True, "
+                "or give a folder of its own"
+            )
         self._next = self._after(self.num_timesteps)
 
     def _after(self, steps: int) -> int:
@@ -221,7 +228,20 @@ class Checkpoints(BaseCallback):
                 self.save()
 
     def _on_step(self) -> bool:
+        self._mid_rollout = True
         return True
+
+    def _on_rollout_end(self) -> None:
+        self._mid_rollout = False
+
+    def _on_training_end(self) -> None:
+        """The end is a checkpoint, too, unless a callback ended the training before its last step was stored."""
+        if self._resumed is not None:  # there was nothing left to do
+            self._restore_training(self._resumed)
+            self._resumed = None
+        elif self.save_freq > 0 and not self._mid_rollout:
+            with going_on(f"the checkpoint after {self.model.num_timesteps:,} env steps"):
+                self.save()
 
     # ---- writing
 
