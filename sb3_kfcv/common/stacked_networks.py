@@ -45,6 +45,57 @@ class StackedLinear(nn.Module):
         return th.baddbmm(bias, x, weight)
 
 
+class _Chain(th.autograd.Function):
+    """
+    The layers of a plain ReLU stack as one step of the graph: what autograd would do, in fewer and larger strides.
+
+    Gradients of the parameters are written into the tensors of the last update instead of new ones, which for large networks
+    costs more than computing them. A second backward pass through the same stack before an optimiser step therefore replaces
+    the first one's gradients; nobody here makes one.
+    """
+
+    @staticmethod
+    def forward(ctx, x, stack, from_first, *parameters):  # type: ignore[no-untyped-def, override]
+        """
+        :param x: input of the stack (inputs, batch, in); or with ``from_first=False`` the first layer's pre-activations
+        :param stack: the networks
+        :param from_first: whether the first layer is part of it
+        :param parameters: those that get a gradient; none for frozen networks
+        """
+        hidden = []
+        z = stack._spread(stack.first(x)) if from_first else x
+        for layer in stack.rest:
+            hidden.append(z.relu_() if hidden or from_first else z.relu())
+            z = th.baddbmm(layer.bias, hidden[-1], layer.weight)
+        ctx.stack, ctx.x, ctx.hidden, ctx.frozen = stack, x if from_first else None, hidden, not parameters
+        ctx.n_parameters = len(parameters)
+        return z
+
+    @staticmethod
+    def backward(ctx, gradient):  # type: ignore[no-untyped-def, override]
+        stack, x = ctx.stack, ctx.x
+        for layer, hidden in zip(reversed(stack.rest), reversed(ctx.hidden), strict=True):
+            if not ctx.frozen:
+                th.bmm(hidden.transpose(1, 2), gradient, out=_gradient_of(layer.weight))
+                th.sum(gradient, dim=1, keepdim=True, out=_gradient_of(layer.bias))
+            gradient = th.ops.aten.threshold_backward(th.bmm(gradient, layer.weight.transpose(1, 2)), hidden, 0)
+        if x is not None and not ctx.frozen:
+            wide = stack._gather_up(gradient)  # (inputs, batch, networks per input · hidden)
+            th.bmm(x.transpose(1, 2), wide, out=_gradient_of(stack.first.weight))
+            th.sum(wide, dim=1, keepdim=True, out=_gradient_of(stack.first.bias))
+        needs_input = ctx.needs_input_grad[0]
+        if needs_input and x is not None:
+            gradient = th.bmm(stack._gather_up(gradient), stack.first.weight.transpose(1, 2))
+        return (gradient if needs_input else None, None, None, *([None] * ctx.n_parameters))
+
+
+def _gradient_of(parameter: nn.Parameter) -> th.Tensor:
+    """The tensor of a parameter's gradient, to be written anew."""
+    if parameter.grad is None:
+        parameter.grad = th.empty_like(parameter)
+    return parameter.grad
+
+
 class StackedMLP(nn.Module):
     """
     A stack of multi-layer perceptrons of one shape.
@@ -86,6 +137,7 @@ class StackedMLP(nn.Module):
         n_weights = n_networks * sum(n_in * n_out for n_in, n_out in pairwise(sizes))
         require_memory(f"a stack of {n_networks} networks {self.sizes}", 16 * n_weights)  # float32; gradient, two moments
         self.activation = activation_fn()
+        self.is_plain = members is None and activation_fn is nn.ReLU
         self.first = StackedLinear(self.n_inputs, sizes[0], n_networks // self.n_inputs * sizes[1])
         self.rest = nn.ModuleList(StackedLinear(n_networks, n_in, n_out) for n_in, n_out in pairwise(sizes[1:]))
         self.member_bias: nn.Parameter | None = None
@@ -100,7 +152,21 @@ class StackedMLP(nn.Module):
         :param x: (inputs, batch, in); with own inputs per network: (members, batch, in)
         :return: (members, batch, out)
         """
+        if self.is_plain and th.is_grad_enabled():
+            return _Chain.apply(x, self, True, *self.parameters())
         return self.after_first_layer(self.first_layer(x))
+
+    def _spread(self, z: th.Tensor) -> th.Tensor:
+        """(inputs, batch, networks per input · hidden) → (networks, batch, hidden), a view."""
+        if self.n_inputs == self.n_networks:
+            return z
+        return z.unflatten(-1, (-1, self.sizes[1])).transpose(1, 2).flatten(0, 1)
+
+    def _gather_up(self, z: th.Tensor) -> th.Tensor:
+        """Inverse of :meth:`_spread`."""
+        if self.n_inputs == self.n_networks:
+            return z
+        return z.unflatten(0, (self.n_inputs, -1)).transpose(1, 2).flatten(2)
 
     def first_layer(self, x: th.Tensor) -> th.Tensor:
         """
@@ -130,6 +196,8 @@ class StackedMLP(nn.Module):
         :param frozen: give no gradient to the parameters
         :return: (members, batch, out)
         """
+        if self.is_plain and frozen and z.requires_grad:
+            return _Chain.apply(z, self, False)
         for layer in self.rest:
             z = layer(self.activation(z), self.members, frozen)
         return z

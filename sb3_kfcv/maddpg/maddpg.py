@@ -15,8 +15,9 @@ from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, polyak_update, safe_mean
+from stable_baselines3.common.utils import FloatSchedule, safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from torch import nn
 
 from sb3_kfcv.common.checks import require_between, require_count, require_finite_columns, require_parameters
 from sb3_kfcv.common.memory import free_memory, in_words
@@ -189,7 +190,10 @@ class MADDPG(SaveableAlgorithm):
         layout = self.layout
         self.agents = list(layout.members(self.team) if self.team else range(layout.n_agents))
         self.n_learning_agents = len(self.agents)
-        self._agent_of_column = [i for i, size in enumerate(layout.action_sizes) for _ in range(size)]
+        adjoin = self.agents == list(range(self.agents[0], self.agents[-1] + 1))
+        self._learning = slice(self.agents[0], self.agents[-1] + 1) if adjoin else self.agents  # a slice makes no copy
+        agent_of_column = [i for i, size in enumerate(layout.action_sizes) for _ in range(size)]
+        self._agent_of_column = th.tensor(agent_of_column, device=self.device)
         self._opponent_policy = self._make_opponent_policy()
         state_size = 0 if self.critic_input == "observations" else layout.state_size
         if self.action_noise is None and not layout.discrete and self.exploration_noise > 0:
@@ -274,6 +278,8 @@ class MADDPG(SaveableAlgorithm):
         self.actor_target = self.policy.actor_target
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
+        networks = (self.actor, self.actor_target, self.critic, self.critic_target)
+        self._parameters = {network: list(network.parameters()) for network in networks}  # asked for at every update
 
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
         """
@@ -307,16 +313,15 @@ class MADDPG(SaveableAlgorithm):
                 own_actions, raw = self.actor.relaxed(batch.observations, self.gumbel_temperature)
                 actor_losses = -live_mean(self.critic.with_own_actions(inputs, own_actions), live)  # (agents,)
                 self._check_losses("actor loss", actor_losses)
-                sizes = by_agent(self.actor.blocks, [output.square().mean(-1) for output in raw])  # (agents, batch)
-                penalty = self.actor_regularization * live_mean(sizes, live).sum()
-                self._minimise(self.actor, actor_losses.sum() + penalty)
+                self._minimise(self.actor, actor_losses.sum() + self._penalty(raw, live))
                 self._watch.actors(actor_losses, own_actions)
 
                 # θ' ← τθ + (1 − τ)θ'
-                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
-                polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+                self._follow(self.critic_target, self.critic)
+                self._follow(self.actor_target, self.actor)
 
-            self.replay_buffer.update_priorities(batch.rows, live_mean(errors[0].detach().abs().T, live.T))
+            if self.replay_buffer.uses_td_errors:
+                self.replay_buffer.update_priorities(batch.rows, live_mean(errors[0].detach().abs().T, live.T))
             self._watch.critics(critic_losses, targets)
 
         self._watch.update_seconds += time.perf_counter() - start
@@ -333,8 +338,8 @@ class MADDPG(SaveableAlgorithm):
         next_actions = self._target_actions(batch.next_observations)
         next_inputs = self._critic_inputs(batch.next_observations, batch.next_states, next_actions, next_alive)
         next_q_values = self.critic_target(next_inputs).amin(0)
-        continues = 1 - batch.dones.T[self.agents]
-        return self.reward_scale * batch.rewards.T[self.agents] + self.gamma * continues * next_q_values
+        continues = 1 - batch.dones.T[self._learning]
+        return self.reward_scale * batch.rewards.T[self._learning] + self.gamma * continues * next_q_values
 
     def teacher_inputs(self, batch: JointReplayBufferSamples) -> th.Tensor:
         """
@@ -358,7 +363,7 @@ class MADDPG(SaveableAlgorithm):
 
     def live(self, batch: JointReplayBufferSamples) -> th.Tensor:
         """(agents, batch): 1 where the learning agent lived at the start of the step."""
-        return batch.alive.T[self.agents]
+        return batch.alive.T[self._learning]
 
     def _critic_inputs(self, observations: th.Tensor, states: th.Tensor, actions: th.Tensor, alive: th.Tensor) -> th.Tensor:
         seen = states if self.critic_input == "state" else observations
@@ -376,6 +381,19 @@ class MADDPG(SaveableAlgorithm):
             actions = self.policy.encode(th.as_tensor(self.policy.from_env(others), device=self.device))
         return actions
 
+    def _penalty(self, raw: list[th.Tensor], live: th.Tensor) -> th.Tensor | float:
+        """The weighted mean squares of the actors' raw outputs, per block (agents, batch, action), summed over agents."""
+        if self.actor_regularization == 0:
+            return 0.0
+        sizes = by_agent(self.actor.blocks, [output.square().mean(-1) for output in raw])  # (agents, batch)
+        return self.actor_regularization * live_mean(sizes, live).sum()
+
+    @th.no_grad()
+    def _follow(self, targets: nn.Module, networks: nn.Module) -> None:
+        """θ' ← τθ + (1 − τ)θ'"""
+        for target, parameter in zip(self._parameters[targets], self._parameters[networks], strict=True):
+            target.lerp_(parameter, self.tau)
+
     def _check_losses(self, quantity: str, losses: th.Tensor) -> None:
         """
         :raises NonFiniteError: names the learning agent whose loss, of (agents,), is not finite; no network has changed
@@ -386,7 +404,8 @@ class MADDPG(SaveableAlgorithm):
             require_finite_columns(f"{quantity} in update {self._n_updates:,}", losses.detach().cpu().numpy(), columns)
 
     def _minimise(self, networks: StackedActors | StackedCritics | OwnObservationCritics, loss: th.Tensor) -> None:
-        networks.optimizer.zero_grad()
+        if not all(stack.is_plain for stack in networks.stacks):  # plain stacks write their gradients anew
+            networks.optimizer.zero_grad()
         loss.backward()
         if self.max_grad_norm is not None:
             for stack in networks.stacks:
@@ -546,7 +565,14 @@ class MADDPG(SaveableAlgorithm):
             "lr_schedule",
             "start_time",
         ]
-        excluded += ["agents", "n_learning_agents", "_agent_of_column", "teacher_input_size"]  # made anew of the settings
+        excluded += [
+            "agents",
+            "n_learning_agents",
+            "_learning",
+            "_agent_of_column",
+            "_parameters",
+            "teacher_input_size",
+        ]  # made anew of the settings
         if any(not isinstance(player, str) for player in (self.opponents or {}).values()):
             excluded.append("opponents")  # models are saved in their own files and given again to load()
         return super()._excluded_save_params() + excluded

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import torch as th
@@ -75,6 +75,8 @@ class JointReplayBuffer(ReplayBuffer):
     :param seed: of the sampling; ``None`` takes fresh entropy
     """
 
+    uses_td_errors: ClassVar[bool] = False  # whether update_priorities() wants to be called
+
     alive: np.ndarray
     states: np.ndarray
     next_states: np.ndarray
@@ -107,6 +109,7 @@ class JointReplayBuffer(ReplayBuffer):
         self.n_added = 0  # steps (of all worlds) ever stored
         self.progress = 0.0  # share of training done, in [0, 1]; set by the learner
         self.normalizer: VecNormalize | None = None
+        self._minibatch = self._empty(0)
 
     @property
     def n_rows(self) -> int:
@@ -154,14 +157,16 @@ class JointReplayBuffer(ReplayBuffer):
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> JointReplayBufferSamples:  # type: ignore[override]
         """
-        Draw a minibatch.
+        Draw a minibatch. Its tensors are written anew by the next call; clone what is to be kept, or use :meth:`rows`.
 
         :param batch_size: number of joint transitions
         :param env: normalises the observations when given
         """
         self.normalizer = env
         rows, weights = self._draw(batch_size)
-        return self.rows(rows, weights)
+        if len(self._minibatch["rewards"]) != batch_size:
+            self._minibatch = self._empty(batch_size)
+        return self._gather(rows, weights, self._minibatch)
 
     def _draw(self, batch_size: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Which rows to draw, and their importance weights (``None``: all one)."""
@@ -174,25 +179,31 @@ class JointReplayBuffer(ReplayBuffer):
         :param rows: (batch,) row numbers
         :param weights: (batch,) importance weights
         """
+        return self._gather(rows, weights, self._empty(len(rows)))
 
-        def take(array: np.ndarray) -> np.ndarray:
-            return np.take(array.reshape(self.buffer_size * self.n_envs, array.shape[-1]), rows, axis=0)
+    def _empty(self, batch_size: int) -> dict[str, th.Tensor]:
+        """Tensors for a minibatch: (batch, …) each."""
+        widths = {name: getattr(self, name).shape[-1] for name in TRANSITION_ARRAYS}
+        tensors = {name: th.empty(batch_size, width) for name, width in widths.items()}
+        return {**tensors, "weights": th.ones(batch_size)}
 
-        return JointReplayBufferSamples(
-            observations=self._tensor(self._normalize_obs(take(self.observations), self.normalizer)),
-            actions=self._tensor(take(self.actions)),
-            next_observations=self._tensor(self._normalize_obs(take(self.next_observations), self.normalizer)),
-            dones=self._tensor(take(self.dones)),
-            rewards=self._tensor(take(self.rewards)),
-            alive=self._tensor(take(self.alive)),
-            states=self._tensor(take(self.states)),
-            next_states=self._tensor(take(self.next_states)),
-            weights=self._tensor(np.ones(len(rows)) if weights is None else weights),
-            rows=rows,
-        )
-
-    def _tensor(self, array: Any) -> th.Tensor:
-        return th.as_tensor(np.asarray(array, dtype=np.float32), device=self.device)
+    def _gather(self, rows: np.ndarray, weights: np.ndarray | None, into: dict[str, th.Tensor]) -> JointReplayBufferSamples:
+        """The rows, written into tensors of :meth:`_empty`."""
+        index = th.from_numpy(rows)
+        n_rows = self.buffer_size * self.n_envs
+        for name in TRANSITION_ARRAYS:
+            stored = th.from_numpy(getattr(self, name)).view(n_rows, -1) if into[name].shape[1] else None
+            if stored is None:
+                continue
+            if stored.dtype == th.float32:
+                th.index_select(stored, 0, index, out=into[name])
+            else:  # the choices of discrete agents
+                into[name].copy_(stored[index])
+            if self.normalizer is not None and name in ("observations", "next_observations"):
+                into[name].copy_(th.as_tensor(self.normalizer.normalize_obs(into[name].numpy())))  # type: ignore[arg-type]
+        if weights is not None:
+            into["weights"].copy_(th.from_numpy(weights))
+        return JointReplayBufferSamples(**{name: tensor.to(self.device) for name, tensor in into.items()}, rows=rows)
 
     def update_priorities(self, rows: np.ndarray, td_errors: th.Tensor) -> None:
         """

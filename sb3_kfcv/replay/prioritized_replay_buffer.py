@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -26,6 +26,8 @@ class PrioritizedReplayBuffer(JointReplayBuffer):
 
     The other parameters are those of :class:`JointReplayBuffer`.
     """
+
+    uses_td_errors: ClassVar[bool] = True
 
     def __init__(
         self,
