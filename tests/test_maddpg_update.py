@@ -527,6 +527,7 @@ def test_priorities_are_the_mean_error_of_the_living():
     (batch,) = draw(model, 1)
     serve(model, [batch])
     received = {}
+    model.replay_buffer.uses_td_errors = True
     model.replay_buffer.update_priorities = lambda rows, errors: received.update(rows=rows, errors=errors)
     with th.no_grad():
         y, inputs = model.td_target(batch), model.teacher_inputs(batch)
