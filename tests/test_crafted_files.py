@@ -104,9 +104,9 @@ def same(one, other):
         return one.keys() == other.keys() and all(same(value, other[key]) for key, value in one.items())
     if isinstance(one, (list, tuple)):
         return len(one) == len(other) and all(map(same, one, other))
-    return (
-        np.array_equal(one, other, equal_nan=True) if isinstance(one, np.ndarray) else bool(th.all(th.as_tensor(one == other)))
-    )
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other, equal_nan=True)
+    return th.equal(one, other) if isinstance(one, th.Tensor) else one == other
 
 
 # ---- a model's settings and counters
@@ -414,8 +414,17 @@ R, T = "replay_buffer", "transitions"
 
 
 def every(change):
-    """An edit of all transitions."""
-    names = ("observations", "next_observations", "actions", "rewards", "dones", "alive", "states", "next_states")
+    """An edit of all transitions, but those that follow the last of an episode."""
+    names = (
+        "observations",
+        "actions",
+        "rewards",
+        "dones",
+        "alive",
+        "states",
+        "next_observations/differs",
+        "next_states/differs",
+    )
     return [array(f"{T}/{name}", change) for name in names]
 
 
@@ -457,6 +466,12 @@ BUFFER = {
     "rewards missing": [drop(T, "rewards")],
     "rewards null": [put(T, "rewards", to=None)],
     "dones of 2": [array(f"{T}/dones", number(2))],
+    "next observations with NaN": [array(f"{T}/next_observations/rows", number(np.nan))],
+    "next observations fewer": [array(f"{T}/next_observations/rows", lambda rows: rows[1:].copy())],
+    "next observations of doubles": [array(f"{T}/next_observations/rows", lambda rows: rows.astype(float))],
+    "next observations unmarked": [array(f"{T}/next_observations/differs", lambda differs: differs * False)],
+    "next observations marked by numbers": [array(f"{T}/next_observations/differs", lambda differs: differs.astype(int))],
+    "next observations missing": [drop(T, "next_observations", "rows")],
     "half alive": [array(f"{T}/alive", number(0.5))],
     "observations of others": [put(T, "observations", "name", to="transitions/rewards.npy"), drop(T, "rewards")],
     **{f"JSON: {name}": [raw("replay_buffer.json", data)] for name, data in NOT_JSON.items()},
@@ -534,6 +549,7 @@ def test_crafted_replay_buffers_are_refused_and_change_nothing(runs, trained, na
 def test_a_buffer_of_many_worlds_that_holds_nothing_takes_no_memory(runs, trained, name, tmp_path):
     """Arrays of no steps may claim any number of worlds."""
     none = every(lambda rows: np.zeros((0, 10**9, *rows.shape[2:]), rows.dtype))
+    none += [array(f"{T}/{name}/rows", lambda rows: rows[:0].copy()) for name in ("next_observations", "next_states")]
     edits = [put(R, "n_added", to=0), put(R, "n_envs", to=10**9), *none]
     path = tampered(runs[name]["buffer"], tmp_path / "buffer.zip", *edits)
     before = snapshot(trained[name])
@@ -1173,8 +1189,9 @@ def what_could_run_code(source):
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, (ast.Import, ast.ImportFrom)):
             words = {word for alias in node.names for word in alias.name.split(".")}
-            words |= set((getattr(node, "module", None) or "").split("."))
-            yield from words & (FORBIDDEN_IMPORTS | FORBIDDEN_NAMES)
+            module = getattr(node, "module", None) or ""
+            yield from (words | set(module.split("."))) & (FORBIDDEN_IMPORTS | FORBIDDEN_NAMES)
+            yield from {f"{module}.{word}" for word in words} & FORBIDDEN_CALLS
         elif isinstance(node, ast.Name):
             yield from {node.id} & FORBIDDEN_NAMES
         elif isinstance(node, ast.Attribute):
@@ -1194,20 +1211,11 @@ def test_no_source_could_run_what_a_file_holds(path):
 @pytest.mark.parametrize(
     "source",
     [
-        *(
-            "eval(text)",
-            "exec(text)",
-            "import pickle",
-            "from pickle import loads",
-            "import cloudpickle as cp",
-            "th.load(path)",
-        ),
+        *("eval(text)", "exec(text)", "import pickle", "from pickle import loads", "import cloudpickle as cp"),
         *("import torch\ntorch.load(path)", "yaml.load(file, yaml.UnsafeLoader)", "yaml.load(file, Loader=yaml.SafeLoader)"),
         *("np.load(path, allow_pickle=True)", "th.load", "__import__(name)", "from yaml import UnsafeLoader"),
-        *(
-            "from stable_baselines3.common.save_util import load_from_zip_file",
-            "import torch as t\nt.load(p, weights_only=False)",
-        ),
+        *("from torch import load", "from yaml import dump, load as read", "import torch as t\nt.load(p, weights_only=False)"),
+        "from stable_baselines3.common.save_util import load_from_zip_file",
     ],
 )
 def test_the_search_finds(source):

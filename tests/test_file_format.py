@@ -38,6 +38,7 @@ from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.saving import values
 from sb3_kfcv.saving.archive import FORMAT_VERSION, MANIFEST, open_archive, write_archive
 from sb3_kfcv.saving.checkpoints import Checkpoint
+from sb3_kfcv.saving.transitions import packed, unpacked
 from sb3_kfcv.saving.values import ARRAY_KINDS, UnwritableError
 
 DTYPES = [np.dtype(name) for name in ("?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")]
@@ -656,3 +657,21 @@ def test_a_smaller_buffer_leaves_nothing_of_the_one_before(tmp_path):
     assert buffer.n_rows == 15
     assert buffer.n_refreshes > 0
     assert max(buffer.curriculum_rows(200)) < 15
+
+
+@pytest.mark.parametrize("n_steps", [0, 1, 7])
+@pytest.mark.parametrize("state_size", [0, 3])
+def test_what_follows_a_step_is_written_once(n_steps, state_size):
+    """And comes back to the bit: at an episode's end, where a zero changes its sign, and where nothing is stored."""
+    rng = np.random.default_rng(0)
+    observations, states = (rng.normal(size=(n_steps + 1, 2, width)).astype(np.float32) for width in (4, state_size))
+    following = observations[1:].copy()
+    if n_steps > 3:
+        following[3, 1] = 5.0
+        observations[3, 0, 0], following[2, 0, 0] = 0.0, -0.0
+    transitions = {"observations": observations[:-1], "next_observations": following, "rewards": observations[:-1, :, 0]}
+    transitions |= {"states": states[:-1], "next_states": states[1:]}
+    stored = packed(transitions)
+    assert len(stored["next_observations"]["rows"]) == {0: 0, 1: 2, 7: 4}[n_steps]
+    for name, array in unpacked(stored).items():
+        assert array.tobytes() == transitions[name].tobytes(), name

@@ -409,7 +409,7 @@ def test_a_longer_training_goes_on_with_its_own_schedule(tmp_path):
     for steps in (60, 120):
         model = learn(small(KFCVMADDPG, grassland(), learning_rate="lin_1e-3"), tmp_path, steps)
         assert model.num_timesteps == steps
-    assert model.replay_buffer.progress == 1
+    assert (model._current_progress_remaining, model.replay_buffer.progress) == (0, 1)
     assert 0 <= model.actor.optimizer.param_groups[0]["lr"] < 1e-3 / 10
 
 
@@ -742,17 +742,20 @@ class Killer:
     :param words: the command line of the first start
     :param seed: of the moments
     :param start_up: seconds from a start to the first step
-    :param training: seconds of training within which to kill
+    :param steps: env steps that a process makes before it is killed, on average
     """
 
-    def __init__(self, folder, words, seed, start_up, training):
+    def __init__(self, folder, words, seed, start_up, steps):
         self.folder, self.words, self.rng = folder, words, np.random.default_rng(seed)
-        self.start_up, self.training = start_up, training
+        self.start_up, self.steps = start_up, steps
         self.counts = dict.fromkeys(("start-up", "training", "writing"), 0)
 
     def next_words(self):
         begun = [path.parent.parent for path in self.folder.glob("*/*/*/args.yml")]
         return ["--resume", str(begun[0]), "--verbose", "0"] if begun else self.words
+
+    def reached(self):
+        return max((max(checkpoints_in(run), default=0) for run in self.folder.glob("*/*")), default=0)
 
     def kill(self, when):
         """
@@ -760,12 +763,13 @@ class Killer:
 
         :return: whether it came to that
         """
+        goal = self.reached() + self.rng.uniform(0, 2 * self.steps)
         process = start(*self.next_words())
         if when == "start-up":
             time.sleep(self.rng.uniform(0, self.start_up))
         else:
-            wait_until(process, lambda: has_begun(process, self.folder))
-            time.sleep(self.rng.uniform(0, self.training))
+            wait_until(process, lambda: has_begun(process, self.folder) and self.reached() >= goal)
+            time.sleep(self.rng.uniform(0, 0.1))  # some steps, and the writing of a checkpoint
             if when == "writing":
                 wait_until(process, lambda: partial_files(process, self.folder))
         process.kill()
@@ -791,19 +795,18 @@ def test_twenty_kills_at_random_moments_change_nothing(tmp_path, algo):
     wait_until(process, lambda: has_begun(process, tmp_path / "whole"))
     start_up = time.monotonic() - began
     assert process.wait() == 0
-    training = time.monotonic() - began - start_up
 
-    killer = Killer(tmp_path / "cut", words["cut"], list(ALGOS).index(algo), start_up, 2 * training / kills)
+    killer = Killer(tmp_path / "cut", words["cut"], list(ALGOS).index(algo), start_up, 0.8 * steps / kills)
     moments = killer.rng.choice(["start-up", "training", "writing"], size=kills, p=[0.2, 0.5, 0.3])
     moments[:2] = "start-up", "training"
-    assert all([killer.kill(when) for when in moments])
+    assert all(killer.kill(when) for when in moments)
     finished = start(*killer.next_words())
     assert finished.wait() == 0
     whole, cut = (run_folder(tmp_path / name, algo=algo) for name in ("whole", "cut"))
     assert_equal_runs(whole, cut)
     assert list(checkpoints_in(whole.path)) == list(checkpoints_in(cut.path))
     assert not list(cut.path.rglob(".*.partial"))
-    print(f"{algo}: {killer.counts}; start-up {start_up:.1f} s, training {training:.1f} s")
+    print(f"{algo}: {killer.counts}")
 
 
 def has_stepped(run):
@@ -821,9 +824,9 @@ def test_a_process_that_was_told_to_stop_and_then_killed_goes_on_exactly(tmp_pat
     printed, errors = process.communicate()
     assert (process.returncode, errors) == (143, "")
     stopped = max(checkpoints_in(cut.path))
-    assert f"stopped: " in printed
-    killer = Killer(tmp_path / "cut", words["cut"], seed=0, start_up=2, training=0.3)
-    assert all([killer.kill(when) for when in ("training", "writing")])
+    assert f"stopped: the last checkpoint is of {stopped:,} env steps; to go on: " in printed
+    killer = Killer(tmp_path / "cut", words["cut"], seed=0, start_up=2, steps=60)
+    assert all(killer.kill(when) for when in ("training", "writing"))
     _, script, *again = shlex.split(printed.rpartition("to go on: ")[2])
     assert (script, train.main(again)) == ("zoo/train.py", 0)
     assert_equal_runs(whole, cut)
@@ -842,7 +845,7 @@ def test_a_second_interrupt_stops_a_long_evaluation_at_once(tmp_path):
     printed, errors = process.communicate()
     assert time.monotonic() - told < 3
     assert (process.returncode, errors) == (130, "")
-    assert "stopped: " in printed
+    assert "stopped: no checkpoint was saved yet; to start again: " in printed
 
 
 def test_twenty_starts_at_once_get_twenty_folders(tmp_path):

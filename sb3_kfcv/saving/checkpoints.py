@@ -37,6 +37,7 @@ from sb3_kfcv.saving.run_state import (
     set_random_state,
 )
 from sb3_kfcv.saving.saveable import SaveableAlgorithm, refusals
+from sb3_kfcv.saving.transitions import packed, unpacked
 from sb3_kfcv.saving.values import check_writable, encode
 
 NAME = re.compile(r"rl_model_(\d+)_steps\.zip")
@@ -142,7 +143,8 @@ class Piece:
         with open_archive(self.path(folder), "transitions") as archive:
             if archive.digest != self.sha256:
                 archive.refuse("is another file than the one that the checkpoint was written with")
-            return archive.read("transitions")
+            with refusals(archive, "transitions"):
+                return unpacked(archive.read("transitions"))
 
 
 class Checkpoints(BaseCallback):
@@ -313,7 +315,9 @@ class Checkpoints(BaseCallback):
         pieces = [piece for piece in self._pieces if piece.last > oldest]
         if first < buffer.n_added:
             new = Piece(first, buffer.n_added, "")
-            new.sha256 = write_archive(new.path(self.folder), "transitions", {"transitions": buffer.transitions(first)})
+            new.sha256 = write_archive(
+                new.path(self.folder), "transitions", {"transitions": packed(buffer.transitions(first))}
+            )
             pieces.append(new)
         return pieces
 

@@ -24,6 +24,7 @@ from sb3_kfcv.saving.attributes import NEEDED, check_attributes
 from sb3_kfcv.saving.files import with_suffix
 from sb3_kfcv.saving.normalization import normalization_state
 from sb3_kfcv.saving.parameters import check_network, check_optimizer
+from sb3_kfcv.saving.transitions import packed, unpacked
 from sb3_kfcv.saving.values import check_writable
 from sb3_kfcv.vec_env.make import layout_of
 
@@ -219,7 +220,7 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
         """
         target = with_suffix(path, ".zip") if isinstance(path, (str, pathlib.Path)) else path
         buffer = self.replay_buffer
-        sections = {"replay_buffer": self.replay_buffer_state(), "transitions": buffer.transitions()}
+        sections = {"replay_buffer": self.replay_buffer_state(), "transitions": packed(buffer.transitions())}
         write_archive(target, "replay buffer", sections)
 
     def replay_buffer_state(self) -> dict[str, Any]:
@@ -237,7 +238,7 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
         """
         source = with_suffix(path, ".zip") if isinstance(path, (str, pathlib.Path)) else path
         with open_archive(source, "replay buffer") as archive, refusals(archive, "replay_buffer"):
-            self.set_replay_buffer_state(archive.read("replay_buffer"), archive.read("transitions"))
+            self.set_replay_buffer_state(archive.read("replay_buffer"), unpacked(archive.read("transitions")))
 
     def set_replay_buffer_state(self, state: dict[str, Any], transitions: dict[str, np.ndarray]) -> None:
         """
