@@ -5,7 +5,7 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 CODE = sb3_kfcv zoo tests benchmarks setup.py
 
-.PHONY: help demo test test-expensive format check-format lint type commit-checks docs clean
+.PHONY: help demo test test-expensive benchmark benchmark-peers format check-format lint type commit-checks docs clean
 
 help:  ## Show the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
@@ -25,6 +25,12 @@ test: $(VENV)/.installed  ## Run the tests (a few minutes)
 
 test-expensive: $(VENV)/.installed  ## Run the long tests: learning to a threshold
 	$(BIN)/python -m pytest -q -m expensive
+
+benchmark: $(VENV)/.installed  ## Measure how fast we are (some minutes; best on an idle machine)
+	$(BIN)/python benchmarks/speed.py
+
+benchmark-peers: $(VENV)/.installed  ## Measure ours beside the peers (under an hour, gigabytes; builds their environments)
+	$(BIN)/python benchmarks/compare.py
 
 format: $(VENV)/.installed  ## Sort imports, format the code
 	$(BIN)/ruff check --select I --fix $(CODE)

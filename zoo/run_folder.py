@@ -126,7 +126,7 @@ class RunFolder:
 
     def describe(self, settings: Mapping[str, Any], arguments: Mapping[str, Any], command: str) -> None:
         """
-        Write down how the run was started.
+        Write down how the run was started; the command line last, which makes it a run that can be resumed.
 
         :param settings: the resolved hyperparameters
         :param arguments: the resolved command line
@@ -134,9 +134,9 @@ class RunFolder:
         """
         texts = {
             "config.yml": _as_yaml(settings),
-            "args.yml": _as_yaml(arguments),
             "command.txt": command + "\n",
             "versions.json": json.dumps({**library_versions(), "platform": platform.platform()}, indent=2) + "\n",
+            "args.yml": _as_yaml(arguments),
         }
         for name, text in texts.items():
             with atomic_write(self.config_file.with_name(name)) as file:

@@ -21,7 +21,6 @@ import torch as th
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import each other as the package ``zoo``
@@ -29,8 +28,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import e
 from sb3_kfcv.common.callbacks import MultiAgentEvalCallback, StopOnSignal
 from sb3_kfcv.common.checks import NonFiniteError
 from sb3_kfcv.common.naming import unknown_name
+from sb3_kfcv.common.patient_logs import PatientResultsWriter
 from sb3_kfcv.maddpg import MADDPG
-from sb3_kfcv.saving.checkpoints import Checkpoints, checkpoints_in
+from sb3_kfcv.saving.checkpoints import Checkpoints, checkpoints_in, latest_checkpoint
 from sb3_kfcv.saving.normalization import load_normalization
 from sb3_kfcv.vec_env.make import layout_of, make_vec_env, metric_names_of
 from zoo.hyperparams import (
@@ -47,6 +47,7 @@ from zoo.run_folder import RunFolder, file_name, read_map
 
 BAD_INPUT = 2  # exit status, as of argparse
 NOT_FINITE = 3  # a loss, reward, observation or action was infinite or NaN
+NOT_WRITTEN = 4  # the training came to its end, but its model could not be written
 SIGNALLED = 128  # plus the number of the signal: 130 after Ctrl-C, 143 after SIGTERM
 
 # Worlds of the evaluation are seeded this far above those of the training, which are seed, seed + 1, …
@@ -340,12 +341,17 @@ def start_logs(training: Training, folder: RunFolder) -> None:
     args = training.args
     header: dict[str, float | str] = {"t_start": env.t_start, "env_id": folder.env_id}
     going_on = args.resume is not None and bool(checkpoints_in(folder.path))
-    env.results_writer = ResultsWriter(str(folder.monitor_file), header, env.info_keywords, override_existing=not going_on)
+    env.results_writer = PatientResultsWriter(
+        str(folder.monitor_file), header, env.info_keywords, override_existing=not going_on
+    )
     log_path = folder.path
     if args.tensorboard_log:
         log_path = Path(args.tensorboard_log) / file_name(args.env) / f"{args.algo}_{folder.number}"
     formats = ["stdout"] if args.verbose > 0 else []
     formats += ["tensorboard"] if args.tensorboard_log != "" else []
+    if args.resume is not None and not going_on:  # it begins again: nothing may stay of what it logged before
+        for path in log_path.glob("events.out.tfevents.*"):
+            path.unlink()
     training.model.set_logger(configure(str(log_path), formats))
 
 
@@ -381,11 +387,15 @@ def train(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseC
         except NonFiniteError as error:
             print(f"error: {error}; the training has stopped after {model.num_timesteps:,} env steps", file=sys.stderr)
             return NOT_FINITE
-    if stop.received is not None:
+    if stop.ending and stop.received is not None:
         return SIGNALLED + stop.received
-    model.save(folder.last_model)
-    if args.save_replay_buffer:
-        model.save_replay_buffer(folder.replay_buffer)
+    try:
+        if args.save_replay_buffer:
+            model.save_replay_buffer(folder.replay_buffer)
+        model.save(folder.last_model)  # the last file: with it the run has ended
+    except (NonFiniteError, OSError) as error:
+        print(f"error: the model could not be written: {error}", file=sys.stderr)
+        return NOT_FINITE if isinstance(error, NonFiniteError) else NOT_WRITTEN
     print(f"trained {model.num_timesteps:,} env steps; the model is {folder.last_model}")
     return 0
 
@@ -411,7 +421,8 @@ def main(argv: Sequence[str] | None = None, extra_callbacks: Sequence[BaseCallba
 
     :param argv: the command line; by default that of the process
     :param extra_callbacks: for whoever starts a run from Python
-    :return: exit status: 0, 2 for bad input, 3 for a number that is not finite, 130 after Ctrl-C, 143 after SIGTERM
+    :return: exit status: 0; 2 for bad input; 3 for a number that is not finite; 4 if the model could not be written at the
+        end; 130 after Ctrl-C, 143 after SIGTERM
     """
     words = [interpreter(), "zoo/train.py", *(sys.argv[1:] if argv is None else argv)]
     try:
@@ -453,6 +464,7 @@ def resume_run(args: argparse.Namespace, extra_callbacks: Sequence[BaseCallback]
             print(
                 f"note: {', '.join(changed)} since the run was begun: it goes on, but perhaps not bit for bit", file=sys.stderr
             )
+        latest_checkpoint(folder.path)  # sets aside what is damaged
         training = build(begun, folder)
         print(f"{begun.algo} on {begun.env}, seed {begun.seed}, goes on in {folder.path}")
         return run(training, folder, extra_callbacks)
@@ -460,10 +472,14 @@ def resume_run(args: argparse.Namespace, extra_callbacks: Sequence[BaseCallback]
 
 def run(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseCallback]) -> int:
     """Train, and say what is left if that did not come to its end."""
-    start_logs(training, folder)
+    try:
+        start_logs(training, folder)
+    except OSError as error:
+        print(f"error: the run cannot write its logs: {error}", file=sys.stderr)
+        return BAD_INPUT
     status = train(training, folder, extra_callbacks)
     if status:
-        print(f"stopped after {training.model.num_timesteps:,} env steps; {what_is_left(folder)}")
+        print(f"stopped: {what_is_left(folder)}")
     return status
 
 

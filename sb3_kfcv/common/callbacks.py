@@ -13,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_kfcv.common.evaluation import evaluate, with_interval
+from sb3_kfcv.common.patient_logs import patience
 from sb3_kfcv.saving.files import atomic_write, going_on
 
 
@@ -83,10 +84,10 @@ class MultiAgentEvalCallback(EventCallback):
         self._log(episodes)
         self.last_mean_reward = float(episodes["reward"].mean())
         if self.last_mean_reward > self.best_mean_reward:
-            self.best_mean_reward = self.last_mean_reward
-            if self.best_model_save_path is not None:
-                with going_on("the best model"):
+            with going_on("the best model"):
+                if self.best_model_save_path is not None:
                     self.model.save(self.best_model_save_path / "best_model.zip")
+                self.best_mean_reward = self.last_mean_reward  # of the model in the file
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All evaluations so far, as in ``evaluations.npz``."""
@@ -106,12 +107,14 @@ class MultiAgentEvalCallback(EventCallback):
         for name, values in episodes.items():
             self.logger.record(f"eval/{names.get(name, name)}", float(values.mean()))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(self.num_timesteps)
+        with patience(self.logger):
+            self.logger.dump(self.num_timesteps)
         if self.verbose:
             returns = {name.removeprefix("return_"): v for name, v in episodes.items() if name.startswith("return_")}
             parts = ", ".join(f"{group} {with_interval(values)}" for group, values in returns.items())
             reward = with_interval(episodes["reward"])
-            print(f"evaluation at {self.num_timesteps:,} env steps: reward {reward} (returns: {parts})")
+            with going_on("the evaluation's result"):
+                print(f"evaluation at {self.num_timesteps:,} env steps: reward {reward} (returns: {parts})")
 
 
 class StopOnSignal(BaseCallback):

@@ -63,8 +63,9 @@ def require_finite_columns(quantity: str, rows: np.ndarray, columns: Mapping[str
     :param columns: whose they are: name → where they stand
     :raises NonFiniteError: names the owner and the quantity if a number is infinite or NaN
     """
-    if math.isfinite(rows.sum()):  # a sum may also overflow: look closer
-        return
+    with np.errstate(over="ignore", invalid="ignore"):
+        if math.isfinite(rows.sum()):  # a sum may also overflow: look closer
+            return
     for name, where in columns.items():
         require_finite(f"the {quantity} of {name}", rows[..., where])
 

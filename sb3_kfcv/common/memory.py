@@ -35,7 +35,7 @@ def require_memory(what: str, n_bytes: int) -> None:
 def in_words(n_bytes: float) -> str:
     """A number of bytes in words, such as ``83.2 MB``."""
     for unit in ("bytes", "kB", "MB", "GB"):
-        if n_bytes < 1000:
+        if n_bytes < 999.5:
             return f"{n_bytes:.3g} {unit}"
         n_bytes /= 1000
-    return f"{n_bytes:,.3g} TB"
+    return f"{n_bytes:.3g} TB" if n_bytes < 99.5 else f"{n_bytes:,.0f} TB"

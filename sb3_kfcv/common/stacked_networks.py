@@ -9,13 +9,32 @@ of ``nn.Linear`` layers would, and is initialised as they are; :meth:`StackedMLP
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from itertools import pairwise
 
 import torch as th
 from torch import nn
 
+from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.memory import require_memory
+
+_weights_left: ContextVar[float] = ContextVar("weights_left", default=math.inf)
+
+
+@contextmanager
+def at_most(n_weights: float) -> Iterator[None]:
+    """
+    Inside, stacks of no more weights than these may be made, all in all: a file cannot ask for networks that it does not hold.
+
+    :raises MemoryError: instead of making more
+    """
+    token = _weights_left.set(n_weights)
+    try:
+        yield
+    finally:
+        _weights_left.reset(token)
 
 
 class StackedLinear(nn.Module):
@@ -134,7 +153,12 @@ class StackedMLP(nn.Module):
         self.input_per_member = n_inputs is None
         self.n_inputs = n_networks if n_inputs is None else n_inputs
         self.sizes = list(sizes)
+        for size in sizes:
+            require_count("the width of a layer", size)
         n_weights = n_networks * sum(n_in * n_out for n_in, n_out in pairwise(sizes))
+        _weights_left.set(_weights_left.get() - n_weights)
+        if _weights_left.get() < 0:
+            raise MemoryError(f"a stack of {n_networks} networks {self.sizes} is more than the file holds")
         require_memory(f"a stack of {n_networks} networks {self.sizes}", 16 * n_weights)  # float32; gradient, two moments
         self.activation = activation_fn()
         self.is_plain = members is None and activation_fn is nn.ReLU

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Sequence
@@ -12,8 +13,9 @@ import torch as th
 from gymnasium import spaces
 from scipy.stats import spearmanr
 
-from sb3_kfcv.common.checks import require_between, require_count
+from sb3_kfcv.common.checks import require_between, require_count, require_finite
 from sb3_kfcv.common.naming import unknown_name
+from sb3_kfcv.common.stacked_networks import at_most
 from sb3_kfcv.curriculum.difficulty import buckets_by_difficulty, combine_agents, cross_validated_errors
 from sb3_kfcv.curriculum.folds import assign_folds, rows_per_fold
 from sb3_kfcv.curriculum.stages import STAGE_RULES, bucket_shares, stage_at, uniform_share
@@ -140,14 +142,20 @@ class KFCVReplayBuffer(JointReplayBuffer):
         :param student: gives the teachers' inputs, TD targets and Q-values
         """
         self.student = student
-        self.teachers = Teachers(
-            self.n_folds,
-            student.n_learning_agents,
-            student.teacher_input_size,
-            self.teacher_net_arch,
-            self.teacher_learning_rate,
-            self.device,
-        )
+        with at_most(math.inf):  # a model's file does not hold them
+            self.teachers = Teachers(
+                self.n_folds,
+                student.n_learning_agents,
+                student.teacher_input_size,
+                self.teacher_net_arch,
+                self.teacher_learning_rate,
+                self.device,
+            )
+
+    def reset(self) -> None:
+        super().reset()
+        self.buckets[:] = UNSCORED
+        self._rows_of_bucket = None
 
     def add(self, *args: Any, **kwargs: Any) -> None:
         first = self.pos * self.n_envs
@@ -298,14 +306,25 @@ class KFCVReplayBuffer(JointReplayBuffer):
 
     def _set_bookkeeping(self, state: dict[str, Any], rows: np.ndarray, own_rows: np.ndarray) -> None:
         size = state["n_steps"] * state["n_envs"]
-        for name, low, high in (("folds", 0, self.n_folds), ("buckets", UNSCORED, self.n_folds), ("scores", -np.inf, np.inf)):
-            values = state[name]
-            alike = values.shape == (size,) and values.dtype == getattr(self, name).dtype
-            if not alike or not ((low <= values) & (values < high)).all():
-                raise ValueError(f"not a replay buffer of this model: its {name} are not those of its transitions")
+        folds, scores, buckets = (state[name] for name in ("folds", "scores", "buckets"))
+        for name, values in (("folds", folds), ("scores", scores), ("buckets", buckets)):
+            if values.shape != (size,) or values.dtype != getattr(self, name).dtype:
+                raise ValueError(f"not a replay buffer of this model: its {name} are {values.shape} of {values.dtype}")
+        require_finite("scores of the replay buffer", scores)
+        n_rows = min(state["n_steps"], state["n_added"]) * state["n_envs"]
+        some_empty = n_rows >= self.n_folds > len(np.unique(folds[:n_rows]))
+        if some_empty or not ((folds >= 0) & (folds < self.n_folds)).all():
+            raise ValueError(f"not a replay buffer of this model: its folds are not 0 to {self.n_folds - 1}")
+        if not ((buckets >= UNSCORED) & (buckets < self.n_folds)).all() or (buckets[n_rows:] != UNSCORED).any():
+            raise ValueError("not a replay buffer of this model: its buckets are not those of its transitions")
         for name in ("updates_since_refresh", "new_since_refresh", "n_refreshes"):
             require_count(name, state[name], least=0)
+        require_between("refresh_seconds", state["refresh_seconds"], 0)
+        stats = dict(state["stats"])
+        for name, value in stats.items():
+            require_between(str(name), value, -np.inf)
         self.teachers.load_state_dict(state["teachers"])
+        self.buckets[:] = UNSCORED
         same = size == len(self.folds) and np.array_equal(rows, own_rows)
         for name in ("folds", "scores", "buckets"):
             values = getattr(self, name)
@@ -313,7 +332,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
         self._updates_since_refresh, self._new_since_refresh = state["updates_since_refresh"], state["new_since_refresh"]
         self.n_refreshes, self._warned = state["n_refreshes"], bool(state["warned"])
         self._rows_of_bucket = None
-        self._stats, self._refresh_seconds = dict(state["stats"]), float(state["refresh_seconds"])
+        self._stats, self._refresh_seconds = stats, float(state["refresh_seconds"])
 
 
 def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:

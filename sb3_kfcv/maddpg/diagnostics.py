@@ -74,9 +74,7 @@ class Diagnostics:
         """Everything that :meth:`series` will show, as plain values; the networks are those of :meth:`series`."""
         logged = self.series(actor, critic)
         return {
-            "critic_losses": list(self._critic_losses),
-            "targets": list(self._targets),
-            "actor_losses": list(self._actor_losses),
+            **{name: th.stack(tuple(noted)) if noted else None for name, noted in self._noted().items()},
             "own_actions": self._own_actions,
             "norms": {n: logged[f"train/{n}_grad_norm"] for n in ("actor", "critic") if f"train/{n}_grad_norm" in logged},
             "update_seconds": self.update_seconds,
@@ -84,12 +82,14 @@ class Diagnostics:
 
     def set_state(self, saved: dict[str, Any]) -> None:
         """Inverse of :meth:`get_state`."""
-        for name in ("critic_losses", "targets", "actor_losses"):
-            own: deque[th.Tensor] = getattr(self, f"_{name}")
-            own.clear()
-            own.extend(saved[name])
+        for name, noted in self._noted().items():
+            noted.clear()
+            noted.extend(() if saved[name] is None else saved[name].unbind())
         self._own_actions, self._norms = list(saved["own_actions"]), dict(saved["norms"])
         self.update_seconds = float(saved["update_seconds"])
+
+    def _noted(self) -> dict[str, deque[th.Tensor]]:
+        return {"critic_losses": self._critic_losses, "targets": self._targets, "actor_losses": self._actor_losses}
 
     def _per_group(self, values: dict[str, float], key: str, stacked: th.Tensor) -> None:
         """Add the mean of ``stacked`` (time, agents) over all learning agents, and over each group where there are several."""

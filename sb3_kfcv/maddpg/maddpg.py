@@ -22,6 +22,7 @@ from torch import nn
 from sb3_kfcv.common.checks import require_between, require_count, require_finite_columns, require_parameters
 from sb3_kfcv.common.memory import free_memory, in_words
 from sb3_kfcv.common.naming import unknown_name
+from sb3_kfcv.common.patient_logs import patience
 from sb3_kfcv.common.schedules import schedule_of
 from sb3_kfcv.common.team_policy import TeamPolicy
 from sb3_kfcv.maddpg.diagnostics import Diagnostics
@@ -291,7 +292,7 @@ class MADDPG(SaveableAlgorithm):
         start = time.perf_counter()
         self.policy.set_training_mode(True)
         self._update_learning_rate([self.actor.optimizer, self.critic.optimizer])  # type: ignore[list-item]
-        self.replay_buffer.progress = 1 - self._current_progress_remaining
+        self.replay_buffer.progress = min(1 - self._current_progress_remaining, 1.0)  # several worlds may overshoot the end
 
         for _ in range(gradient_steps):
             self._n_updates += 1
@@ -496,7 +497,8 @@ class MADDPG(SaveableAlgorithm):
         for key, value in {**self._watch.series(self.actor, self.critic), **self.replay_buffer.diagnostics()}.items():
             self.logger.record(key, value, exclude=NOT_TENSORBOARD if isinstance(value, th.Tensor) else None)
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        super().dump_logs()
+        with patience(self.logger):
+            super().dump_logs()
 
     def learn(
         self: SelfMADDPG,

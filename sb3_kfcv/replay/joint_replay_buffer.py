@@ -248,20 +248,21 @@ class JointReplayBuffer(ReplayBuffer):
         if set(state) != expected:
             odd = ", ".join(sorted(set(state) ^ expected))
             raise ValueError(f"not a replay buffer of this model: {odd} differ")
-        n_steps, n_envs, n_added = (state[name] for name in ("n_steps", "n_envs", "n_added"))
-        for name, value in (("n_steps", n_steps), ("n_envs", n_envs), ("n_added", n_added)):
-            require_count(name, value, least=0 if name == "n_added" else 1)
+        for name, least in (("n_steps", 1), ("n_envs", 1), ("n_added", 0)):
+            require_count(name, state[name], least)
+        n_steps, n_envs, n_added = (int(state[name]) for name in ("n_steps", "n_envs", "n_added"))
+        if max(n_steps, n_added) * n_envs >= 2**62:
+            raise ValueError(f"not a replay buffer of this model: it claims {n_added} of {n_steps} steps of {n_envs} worlds")
         held = min(n_added, n_steps)
         n_rows = held * n_envs
         self._check_transitions(transitions, held, n_envs)
-        rows = (np.arange(n_added - held, n_added)[:, None] % n_steps * n_envs + np.arange(n_envs)).ravel()  # the oldest first
-        if (n_steps, n_envs) == (self.buffer_size, self.n_envs):
-            n_added = int(n_added)
-        else:
+        require_between("progress", state["progress"], 0, 1)
+        type(self.rng.bit_generator)().state = state["rng"]  # refused here or nowhere: nothing has changed yet
+        rows = np.arange((n_added - held) * n_envs, n_added * n_envs) % (n_steps * n_envs)  # the oldest first
+        if (n_steps, n_envs) != (self.buffer_size, self.n_envs):
             n_added = held = min(held * n_envs // self.n_envs, self.buffer_size)
             rows = rows[len(rows) - held * self.n_envs :]
         slots = np.arange(n_added - held, n_added) % self.buffer_size
-        require_between("progress", state["progress"], 0, 1)
         self._set_bookkeeping(state, rows, (slots[:, None] * self.n_envs + np.arange(self.n_envs)).ravel())
         self.rng.bit_generator.state = state["rng"]
         self.progress = state["progress"]
@@ -273,11 +274,12 @@ class JointReplayBuffer(ReplayBuffer):
 
     def _set_bookkeeping(self, state: dict[str, Any], rows: np.ndarray, own_rows: np.ndarray) -> None:
         """
-        Take over what a kind of replay notes of each row.
+        Take over what a kind of replay notes of each row; the last thing that can be refused, and then nothing is taken over.
 
         :param state: as :meth:`state` gave it
         :param rows: its rows, the oldest first
         :param own_rows: where they lie now
+        :raises ValueError: if the notes are not of these transitions
         """
 
     def _check_transitions(self, transitions: dict[str, np.ndarray], held: int, n_envs: int) -> None:
@@ -294,6 +296,13 @@ class JointReplayBuffer(ReplayBuffer):
                     f"of {getattr(self, name).dtype}"
                 )
             require_finite(f"{name} of the replay buffer", array)
+        for name in ("dones", "alive"):
+            if not np.isin(transitions[name], (0, 1)).all():
+                raise ValueError(f"not a replay buffer of this model: {name} must be 0 or 1")
+        if isinstance(self.action_space, spaces.MultiDiscrete):
+            choices = transitions["actions"]
+            if not ((choices >= 0) & (choices < self.action_space.nvec)).all():
+                raise ValueError(f"not a replay buffer of this model: actions are choices among {self.action_space.nvec}")
 
 
 def n_bytes(

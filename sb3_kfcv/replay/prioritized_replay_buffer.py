@@ -65,6 +65,10 @@ class PrioritizedReplayBuffer(JointReplayBuffer):
         """Importance correction now: from ``beta_init`` to 1 as training progresses."""
         return self.beta_init + (1 - self.beta_init) * self.progress
 
+    def reset(self) -> None:
+        super().reset()
+        self._by_rank = np.empty(0, dtype=np.int64)
+
     def add(self, *args: Any, **kwargs: Any) -> None:
         first = self.pos * self.n_envs
         self.td_errors[first : first + self.n_envs] = np.inf
@@ -108,7 +112,8 @@ class PrioritizedReplayBuffer(JointReplayBuffer):
 
     def _set_bookkeeping(self, state: dict[str, Any], rows: np.ndarray, own_rows: np.ndarray) -> None:
         td_errors, by_rank = state["td_errors"], state["by_rank"]
-        if td_errors.shape != (state["n_envs"] * min(state["n_steps"], state["n_added"]),) or not (td_errors >= 0).all():
+        n_rows = state["n_envs"] * min(state["n_steps"], state["n_added"])
+        if td_errors.shape != (n_rows,) or td_errors.dtype != self.td_errors.dtype or not (td_errors >= 0).all():
             raise ValueError("not a replay buffer of this model: its td_errors are no |δ| of its transitions")
         is_order = by_rank.dtype == np.int64 and np.array_equal(np.sort(by_rank), np.arange(len(by_rank)))
         if not is_order or len(by_rank) > len(td_errors):

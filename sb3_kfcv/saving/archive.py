@@ -21,10 +21,11 @@ import pathlib
 import platform
 import re
 import zipfile
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from importlib.metadata import version
-from typing import Any, BinaryIO, NoReturn
+from typing import IO, Any, BinaryIO, NoReturn
 
 import numpy as np
 
@@ -38,9 +39,18 @@ LIBRARIES = ("stable_baselines3", "torch", "numpy", "gymnasium", "pettingzoo", "
 
 MANIFEST = "manifest.json"
 MEMBER = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*(/[A-Za-z0-9_][A-Za-z0-9_.\-]*)*")
+# The start of a .npy member, as numpy writes it: numbers or booleans, little-endian, in C order.
+NPY_HEADER = re.compile(
+    rb"\x93NUMPY\x01\x00..\{'descr': '([<|][%s][1248])', 'fortran_order': False, "
+    rb"'shape': \(((?:\d{1,18}, ?)*\d{0,18})\), \} *\n" % ARRAY_KINDS.encode(),
+    re.DOTALL,
+)
 SEAL = b"sha256:"  # the archive comment: this, and 64 hexadecimal digits
 SEAL_SIZE = len(SEAL) + 64
+LOCAL_HEADER = 30  # bytes that stand before a member's name and data in a zip
 CHUNK = 1 << 20  # bytes
+UNREADABLE = (zipfile.BadZipFile, ValueError, OSError, EOFError, RuntimeError, MemoryError)  # what reading it may raise
+LONGEST_MESSAGE = 400  # characters: what a file says of itself may be of any length
 
 Source = str | pathlib.Path | io.BufferedIOBase | BinaryIO
 
@@ -49,6 +59,7 @@ class FileFormatError(ValueError):
     """A file that is damaged, crafted, or of another kind; the message names the file, and the member where there is one."""
 
 
+@cache
 def library_versions() -> dict[str, str]:
     """Versions of Python, of this package and of the libraries that it stands on."""
     return {"python": platform.python_version(), "sb3_kfcv": __version__} | {name: version(name) for name in LIBRARIES}
@@ -82,7 +93,7 @@ def _encoded(section: str, value: Any) -> tuple[Any, dict[str, np.ndarray]]:
     arrays: dict[str, np.ndarray] = {}
 
     def store(place: str, array: np.ndarray) -> str:
-        stem = "/".join(re.sub(r"[^A-Za-z0-9_.\-]", "_", part).lstrip(".-") or "_" for part in place.split("/"))
+        stem = "/".join(re.sub(r"[^A-Za-z0-9_.\-]", "_", part[:100]).lstrip(".-") or "_" for part in place.split("/"))
         name = f"{stem}.npy"
         while name in arrays:
             name = f"{name.removesuffix('.npy')}_.npy"
@@ -132,7 +143,7 @@ def _write_member(archive: zipfile.ZipFile, name: str, *parts: Any) -> dict[str,
     return {"bytes": info.file_size, "sha256": digest.hexdigest()}
 
 
-def _digest_of_rest(file: BinaryIO, size: int) -> str:
+def _digest_of_rest(file: IO[bytes], size: int) -> str:
     """SHA-256 of the first ``size`` bytes."""
     digest = hashlib.sha256()
     file.seek(0)
@@ -159,11 +170,10 @@ class Archive:
         self.digest = self._check_seal()
         try:
             self._zip = zipfile.ZipFile(file)
-            infos = self._zip.infolist()
-        except (zipfile.BadZipFile, ValueError, NotImplementedError, OSError, EOFError) as error:
+        except UNREADABLE as error:
             self.refuse(f"is damaged: {error}")
-        self._members = {info.filename: info for info in infos}
-        self._check_members(infos)
+        self._check_members(self._zip)
+        self._members = {info.filename: info for info in self._zip.infolist()}
         self.manifest = self._read_json(MANIFEST)
         self._check_manifest(kinds)
         self.kind: str = self.manifest["kind"]
@@ -172,7 +182,8 @@ class Archive:
         """
         :raises FileFormatError: always, with the name of the file
         """
-        raise FileFormatError(f"{self.name} {what}") from None
+        what = " ".join(what.split())
+        raise FileFormatError(f"{self.name} {what[:LONGEST_MESSAGE]}{'…' * (len(what) > LONGEST_MESSAGE)}") from None
 
     def __contains__(self, section: str) -> bool:
         return f"{section}.json" in self._members
@@ -190,8 +201,16 @@ class Archive:
         plain = self._read_json(f"{section}.json")
         if without and isinstance(plain, dict):
             plain = {key: value for key, value in plain.items() if key not in without}
+        read: set[str] = set()
+
+        def fetch(name: str) -> np.ndarray:
+            if name in read:  # a file must not unfold to more than its size
+                raise ValueError(f"the array {name!r} stands in it twice")
+            read.add(name)
+            return self._read_array(name)
+
         with self._naming(f"{section}.json"):
-            return decode(plain, section, self._read_array)
+            return decode(plain, section, fetch)
 
     @contextmanager
     def _naming(self, member: str) -> Iterator[None]:
@@ -202,7 +221,7 @@ class Archive:
             raise
         except RecursionError:
             self.refuse(f"holds values nested too deeply: {member}")
-        except (ValueError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile, MemoryError) as error:
+        except UNREADABLE as error:
             self.refuse(f"cannot be read: {member}: {error}")
 
     def _check_seal(self) -> str:
@@ -221,7 +240,7 @@ class Archive:
         try:
             with zipfile.ZipFile(self._file) as archive:
                 names = archive.namelist()
-        except (zipfile.BadZipFile, ValueError, NotImplementedError, OSError, EOFError):
+        except UNREADABLE:
             names = []
         if "_stable_baselines3_version" in names:
             return (
@@ -235,32 +254,38 @@ class Archive:
 
     def _what_is_damaged(self) -> str:
         """Which member does not fit its checksum."""
+        suspect = "the zip directory, or the checksum at the end"
         try:
             with zipfile.ZipFile(self._file) as archive:
-                members = json.loads(archive.read(MANIFEST))["members"]
-                for name, entry in members.items():
-                    try:
-                        digest = hashlib.sha256(archive.read(name)).hexdigest()
-                    except (zipfile.BadZipFile, KeyError, OSError, EOFError, NotImplementedError, ValueError):
-                        return name
-                    if digest != entry["sha256"]:
-                        return name
-        except (zipfile.BadZipFile, KeyError, OSError, EOFError, NotImplementedError, ValueError, TypeError, AttributeError):
-            return MANIFEST
-        return "the zip directory, or the checksum at the end"
+                self._check_members(archive)
+                suspect = MANIFEST
+                for name, entry in json.loads(archive.read(MANIFEST))["members"].items():
+                    suspect = name
+                    with archive.open(name) as member:
+                        if _digest_of_rest(member, archive.getinfo(name).file_size) != entry["sha256"]:
+                            return name
+            return "the zip directory, or the checksum at the end"
+        except (*UNREADABLE, KeyError, TypeError, AttributeError):
+            return suspect
 
-    def _check_members(self, infos: list[zipfile.ZipInfo]) -> None:
-        if len(self._members) != len(infos):
+    def _check_members(self, archive: zipfile.ZipFile) -> None:
+        infos = archive.infolist()
+        if len(set(archive.namelist())) != len(infos):
             self.refuse("holds a member twice")
-        if sum(info.file_size for info in infos) > self._size:
-            self.refuse("claims more than it holds")
         for info in infos:
             plain = (
                 info.compress_type == zipfile.ZIP_STORED and info.compress_size == info.file_size and not info.flag_bits & 1
             )
-            if not plain or not MEMBER.fullmatch(info.filename) or info.is_dir():
-                self.refuse(f"holds a member that is not allowed: {info.filename!r}")
-        if MANIFEST not in self._members:
+            if not plain or not MEMBER.fullmatch(info.orig_filename):
+                self.refuse(f"holds a member that is not allowed: {info.orig_filename!r}")
+        end = 0
+        for info in sorted(infos, key=lambda info: info.header_offset):
+            if info.header_offset < end:
+                self.refuse(f"claims more than it holds: {info.filename} lies inside of another member")
+            end = info.header_offset + LOCAL_HEADER + len(info.filename) + info.file_size
+        if end > self._size:
+            self.refuse("claims more than it holds")
+        if MANIFEST not in archive.namelist():
             self.refuse(f"lacks {MANIFEST}")
 
     def _check_manifest(self, kinds: Collection[str]) -> None:
@@ -291,15 +316,13 @@ class Archive:
         if not isinstance(name, str) or not name.endswith(".npy") or name not in self._members:
             raise ValueError(f"there is no array {name!r}")
         with self._naming(name), self._zip.open(name) as member:
-            read_header: Callable[..., Any] = {
-                (1, 0): np.lib.format.read_array_header_1_0,
-                (2, 0): np.lib.format.read_array_header_2_0,
-            }.get(np.lib.format.read_magic(member), _no_header)
-            shape, fortran_order, dtype = read_header(member)
-            if dtype.kind not in ARRAY_KINDS or dtype.itemsize > 8 or fortran_order:
-                raise ValueError(f"an array of {dtype} is not allowed")
+            start = member.read(10)
+            header = NPY_HEADER.fullmatch(start + member.read(int.from_bytes(start[8:], "little")))
+            if header is None:
+                raise ValueError("it does not begin as an array of numbers does (npy 1.0, C order)")
+            dtype, shape = np.dtype(header[1].decode()), tuple(int(axis) for axis in re.findall(rb"\d+", header[2]))
             size = self._members[name].file_size - member.tell()
-            if any(axis < 0 for axis in shape) or math.prod(shape) * dtype.itemsize != size:
+            if math.prod(shape) * dtype.itemsize != size:
                 raise ValueError(f"its header says {shape} of {dtype}, its size {size} bytes")
             array = np.empty(shape, dtype)
             view = array.reshape(-1).view(np.uint8).data
@@ -309,10 +332,6 @@ class Archive:
             if filled < size or member.read(1):
                 raise ValueError("it is cut off")
             return array
-
-
-def _no_header(_: Any) -> NoReturn:
-    raise ValueError("unknown version of the npy header")
 
 
 @contextmanager

@@ -19,14 +19,16 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
 from sb3_kfcv.saving.archive import Archive, FileFormatError, open_archive, write_archive
 from sb3_kfcv.saving.files import going_on
 from sb3_kfcv.saving.run_state import (
     UnreadableEnvError,
     callback_states,
+    callbacks_of,
     env_state,
+    envs_of,
     log_state,
     random_state,
     set_callback_states,
@@ -35,6 +37,7 @@ from sb3_kfcv.saving.run_state import (
     set_random_state,
 )
 from sb3_kfcv.saving.saveable import SaveableAlgorithm, refusals
+from sb3_kfcv.saving.transitions import packed, unpacked
 from sb3_kfcv.saving.values import check_writable, encode
 
 NAME = re.compile(r"rl_model_(\d+)_steps\.zip")
@@ -66,12 +69,15 @@ def latest_checkpoint(folder: str | Path) -> Checkpoint | None:
     :param folder: of a training
     :return: ``None`` if there is none
     """
-    for steps, path in checkpoints_in(folder).items():
+    found = checkpoints_in(folder)
+    for steps, path in found.items():
         try:
             return Checkpoint(path)
         except (FileFormatError, OSError) as error:
-            path.replace(path.with_name(f"{path.name}.damaged"))
-            warnings.warn(f"the checkpoint after {steps:,} env steps is of no use, going back to the one before: {error}")
+            aside = path.replace(path.with_name(f"{path.name}.damaged"))
+            warnings.warn(f"the checkpoint after {steps:,} env steps is of no use, and set aside as {aside.name}: {error}")
+    if found:
+        warnings.warn(f"no checkpoint in {folder} is whole: the training starts from the beginning")
     return None
 
 
@@ -137,7 +143,8 @@ class Piece:
         with open_archive(self.path(folder), "transitions") as archive:
             if archive.digest != self.sha256:
                 archive.refuse("is another file than the one that the checkpoint was written with")
-            return archive.read("transitions")
+            with refusals(archive, "transitions"):
+                return unpacked(archive.read("transitions"))
 
 
 class Checkpoints(BaseCallback):
@@ -195,12 +202,10 @@ class Checkpoints(BaseCallback):
             self._next = state["next"]
 
     def _on_training_start(self) -> None:
-        try:
-            check_writable({"the state of the worlds": env_state(self.training_env)})
-        except UnreadableEnvError as unreadable:
-            warnings.warn(
-                f"the state of {unreadable} cannot be read: a resumed training starts new episodes; everything else is exact"
-            )
+        self._check_surroundings()
+        self._pieces = []
+        for path in (*self.folder.glob(".*.partial"), *self.folder.glob("transitions/.*.partial")):
+            path.unlink(missing_ok=True)  # of a process that was killed while it wrote
         self._resumed = latest_checkpoint(self.folder) if self.resume else None
         if self._resumed is not None:
             self._restore_model(self._resumed)
@@ -214,6 +219,29 @@ class Checkpoints(BaseCallback):
                 "or give a folder of its own"
             )
         self._next = self._after(self.num_timesteps)
+
+    def _check_surroundings(self) -> None:
+        """
+        Say which worlds cannot go on.
+
+        :raises ValueError: if another callback would write files of the same names
+        """
+        envs = [self.training_env]
+        for callback in callbacks_of(self.locals["callback"]):
+            envs += envs_of(callback).values()
+            if isinstance(callback, CheckpointCallback) and callback.name_prefix == "rl_model":
+                if Path(callback.save_path).resolve() == self.folder.resolve():
+                    raise ValueError(
+                        f"CheckpointCallback writes files of the same names into {self.folder}: give it another name_prefix"
+                    )
+        for env in envs:
+            try:
+                check_writable({"the state of the worlds": env_state(env)})
+            except UnreadableEnvError as unreadable:
+                warnings.warn(
+                    f"the state of {unreadable} cannot be read: a resumed training starts new episodes; "
+                    "everything else is exact"
+                )
 
     def _after(self, steps: int) -> int:
         return (steps // self.save_freq + 1) * self.save_freq if self.save_freq > 0 else 0
@@ -287,7 +315,9 @@ class Checkpoints(BaseCallback):
         pieces = [piece for piece in self._pieces if piece.last > oldest]
         if first < buffer.n_added:
             new = Piece(first, buffer.n_added, "")
-            new.sha256 = write_archive(new.path(self.folder), "transitions", {"transitions": buffer.transitions(first)})
+            new.sha256 = write_archive(
+                new.path(self.folder), "transitions", {"transitions": packed(buffer.transitions(first))}
+            )
             pieces.append(new)
         return pieces
 
@@ -303,8 +333,11 @@ class Checkpoints(BaseCallback):
 
     def _pieces_known(self, path: Path) -> list[Piece]:
         if path not in self._pieces_of:
-            with open_archive(path, "checkpoint") as archive:
-                self._pieces_of[path] = [Piece(**piece) for piece in archive.read("training")["transitions"]]
+            try:
+                with open_archive(path, "checkpoint") as archive:
+                    self._pieces_of[path] = [Piece(**piece) for piece in archive.read("training")["transitions"]]
+            except FileFormatError:  # of no use, see latest_checkpoint()
+                self._pieces_of[path] = []
         return self._pieces_of[path]
 
     # ---- going on
@@ -315,12 +348,13 @@ class Checkpoints(BaseCallback):
         """
         self._check_settings(checkpoint)
         model, attributes = self.model, dict(checkpoint.attributes)
-        for name in ("algorithm", "verbose", "tensorboard_log", "opponents"):
+        for name in ("algorithm", "verbose", "tensorboard_log", "opponents", "_total_timesteps"):
             attributes.pop(name, None)
         with refusals(checkpoint, "parameters"):
             model.set_parameters(model.checked_parameters(checkpoint.parameters))
         with refusals(checkpoint, "replay_buffer"):
-            model.set_replay_buffer_state(checkpoint.replay_buffer, checkpoint.transitions)
+            none_yet = model.replay_buffer.transitions(model.replay_buffer.n_added)
+            model.set_replay_buffer_state(checkpoint.replay_buffer, checkpoint.transitions or none_yet)
         vars(model).update(attributes)
         self._pieces = self._pieces_of[checkpoint.path] = checkpoint.pieces
         self.last_path = checkpoint.path
@@ -330,8 +364,10 @@ class Checkpoints(BaseCallback):
         algorithm = type(model).__name__
         if saved["algorithm"] != algorithm:
             raise ValueError(f"{checkpoint.path} is of {saved['algorithm']}; this model is a {algorithm}")
+        if saved["layout"] != model.layout:
+            raise ValueError(f"{checkpoint.path} is of another world: {saved['layout']}; this model's has {model.layout}")
         names = [name for name in inspect.signature(type(model)).parameters if name not in FREE_SETTINGS]
-        for name in ("layout", "n_envs", *names):
+        for name in ("n_envs", *names):
             if name in saved and _comparable(saved[name]) != _comparable(getattr(model, name)):
                 ours = getattr(model, name)
                 raise ValueError(f"{checkpoint.path} was written with {name}={saved[name]}; this model has {name}={ours}")

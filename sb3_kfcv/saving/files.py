@@ -41,11 +41,11 @@ def atomic_write(path: str | pathlib.Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def going_on(what: str) -> Iterator[None]:
-    """A file that cannot be written (the disk is full) costs no training: a warning, and the older file stays."""
+    """A file that cannot be written (disk or memory are full) costs no training: a warning, and the older file stays."""
     try:
         yield
-    except OSError as error:
-        warnings.warn(f"{what} could not be written, the training goes on: {error}", stacklevel=3)
+    except (OSError, MemoryError) as error:
+        warnings.warn(f"{what} could not be written, the training goes on: {str(error) or type(error).__name__}", stacklevel=3)
 
 
 def _sync_folder(folder: pathlib.Path) -> None:

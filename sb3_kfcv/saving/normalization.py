@@ -17,6 +17,8 @@ SETTINGS = ("clip_obs", "epsilon")
 def normalization_state(env: VecNormalize) -> dict[str, Any]:
     """What normalises the observations: mean, variance and count, and the settings."""
     statistics: Any = env.obs_rms
+    for name in ("mean", "var"):
+        require_finite(f"the {name} of the observations", getattr(statistics, name))
     return {
         **{"mean": statistics.mean, "var": statistics.var, "count": float(statistics.count)},
         **{name: float(getattr(env, name)) for name in SETTINGS},
@@ -34,6 +36,8 @@ def set_normalization_state(env: VecNormalize, state: dict[str, Any]) -> None:
         if state[name].shape != env.observation_space.shape:
             raise ValueError(f"it is for observations {state[name].shape}; the env has {env.observation_space.shape}")
         require_finite(f"the {name} of the observations", state[name])
+    if (state["var"] < 0).any():
+        raise ValueError("the var of the observations must not be negative")
     for name in ("count", *SETTINGS):
         require_between(name, state[name], 0)
     statistics.mean, statistics.var = (np.array(state[name]) for name in ("mean", "var"))

@@ -11,6 +11,7 @@ import random
 import time
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,9 @@ from sb3_kfcv.vec_env.particle_vec_env import ParticleVecEnv
 
 def random_state(model: BaseAlgorithm) -> dict[str, Any]:
     """The generators that are not inside of a buffer or a world: Python's, NumPy's, PyTorch's, the warm-up's."""
+    version, internal, gauss = random.getstate()
     return {
-        "python": random.getstate(),
+        "python": {"version": version, "internal": np.array(internal, dtype=np.uint64), "gauss": gauss},
         "numpy": np.random.get_state(legacy=False),
         "torch": th.get_rng_state(),
         "cuda": th.cuda.get_rng_state_all() if th.cuda.is_available() else [],
@@ -45,7 +47,8 @@ def random_state(model: BaseAlgorithm) -> dict[str, Any]:
 
 def set_random_state(model: BaseAlgorithm, state: dict[str, Any]) -> None:
     """Inverse of :func:`random_state`."""
-    random.setstate(state["python"])
+    python = state["python"]
+    random.setstate((python["version"], tuple(python["internal"].tolist()), python["gauss"]))
     np.random.set_state(state["numpy"])
     th.set_rng_state(state["torch"])
     if th.cuda.is_available() and state["cuda"]:
@@ -218,12 +221,9 @@ def set_callback_states(root: BaseCallback, states: list[dict[str, Any]]) -> Non
 def _callback_state(callback: BaseCallback) -> dict[str, Any]:
     attributes = vars(callback)
     envs = {}
-    for name, value in attributes.items():
-        if isinstance(value, VecEnv):
-            try:
-                envs[name] = env_state(value)
-            except UnreadableEnvError:
-                continue
+    for name, env in envs_of(callback).items():
+        with suppress(UnreadableEnvError):
+            envs[name] = env_state(env)
     if hasattr(callback, "get_state"):
         return {"values": callback.get_state(), "envs": envs}
     given = set(inspect.signature(type(callback).__init__).parameters) | set(OF_THE_TRAINING) | set(envs)
@@ -231,6 +231,11 @@ def _callback_state(callback: BaseCallback) -> dict[str, Any]:
         "values": {name: value for name, value in attributes.items() if name not in given and _is_plain(value)},
         "envs": envs,
     }
+
+
+def envs_of(callback: BaseCallback) -> dict[str, VecEnv]:
+    """The worlds that a callback holds, such as those of an evaluation, by their attribute."""
+    return {name: value for name, value in vars(callback).items() if isinstance(value, VecEnv)}
 
 
 def _is_plain(value: Any) -> bool:
@@ -254,12 +259,14 @@ def log_state(model: BaseAlgorithm, folder: Path) -> dict[str, Any]:
     logger = model.logger
     boards = {}
     for board in _tensorboards(model):
-        board.flush()
+        with suppress(OSError):  # a log that cannot be written costs no checkpoint
+            board.flush()
         log_dir = Path(board.log_dir)
         boards[os.path.relpath(log_dir, folder)] = {path.name: _synced_size(path) for path in _event_files(log_dir)}
     files = {}
     for handle in _text_logs(model):
-        handle.flush()
+        with suppress(OSError):
+            handle.flush()
         files[os.path.relpath(handle.name, folder)] = _synced_size(Path(handle.name))
     pending = {
         name: float(value) for name, value in logger.name_to_value.items() if isinstance(value, (int, float, np.number))
@@ -275,19 +282,26 @@ def log_state(model: BaseAlgorithm, folder: Path) -> dict[str, Any]:
 
 
 def set_log_state(model: BaseAlgorithm, state: dict[str, Any], folder: Path) -> None:
-    """Cut the logs back to where they were when :func:`log_state` was called: what came after is logged again."""
-    for relative, sizes in state["boards"].items():
-        log_dir = folder / relative
-        own = [board for board in _boards(model) if Path(board.writer.log_dir).resolve() == log_dir.resolve()]
-        for board in own:
-            board.writer.close()
+    """
+    Cut the logs back to where they were when :func:`log_state` was called: what came after is logged again. TensorBoard goes
+    on in the folder where it was, where ``learn`` has begun one beside it.
+    """
+    for board, (relative, sizes) in zip(_boards(model), state["boards"].items(), strict=False):
+        log_dir, begun = (folder / relative).resolve(), Path(board.writer.log_dir).resolve()
+        if begun.parent != log_dir.parent:  # now logged elsewhere
+            continue
+        board.writer.close()
         for path in _event_files(log_dir):
             if path.name in sizes:
                 _cut(path, sizes[path.name])
             else:
                 path.unlink()
-        for board in own:
-            board.writer = type(board.writer)(log_dir=str(log_dir))
+        if begun != log_dir:
+            for path in begun.glob(f"events.out.tfevents.*.{os.getpid()}.*"):
+                path.unlink()
+            with suppress(OSError):
+                begun.rmdir()
+        board.writer = type(board.writer)(log_dir=str(log_dir))
     for relative, size in state["files"].items():
         _cut(folder / relative, size)
     logger = model.logger

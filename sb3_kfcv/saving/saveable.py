@@ -10,7 +10,6 @@ from typing import Any, ClassVar, NoReturn, Protocol, TypeVar
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -18,11 +17,14 @@ from stable_baselines3.common.utils import get_system_info
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_kfcv.common.layout import AgentLayout
+from sb3_kfcv.common.stacked_networks import at_most
 from sb3_kfcv.replay.joint_replay_buffer import JointReplayBuffer
 from sb3_kfcv.saving.archive import Archive, FileFormatError, Source, open_archive, write_archive
+from sb3_kfcv.saving.attributes import NEEDED, check_attributes
 from sb3_kfcv.saving.files import with_suffix
 from sb3_kfcv.saving.normalization import normalization_state
 from sb3_kfcv.saving.parameters import check_network, check_optimizer
+from sb3_kfcv.saving.transitions import packed, unpacked
 from sb3_kfcv.saving.values import check_writable
 from sb3_kfcv.vec_env.make import layout_of
 
@@ -33,7 +35,7 @@ MODEL_KINDS = ("model", "checkpoint")
 # What comes of values that do not fit where they are put.
 WRONG_VALUES = (
     *(ValueError, TypeError, KeyError, AttributeError, IndexError, RuntimeError),
-    *(OverflowError, AssertionError, MemoryError),
+    *(ArithmeticError, AssertionError, MemoryError),
 )
 
 
@@ -156,8 +158,15 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
                 print("saved with:", archive.manifest.get("libraries"))
             with refusals(archive, "attributes"):
                 attributes = {**archive.read("attributes", without=tuple(custom_objects or ())), **(custom_objects or {})}
-                cls._check_attributes(attributes, archive)
-                attributes.pop("algorithm")
+                if not attributes.keys() >= NEEDED:
+                    raise ValueError("they are not those of a model")
+                algorithm = attributes.pop("algorithm")
+                if algorithm != cls.__name__:
+                    archive.refuse(f"was saved by {algorithm}; load it with {algorithm}.load")
+                check_attributes(attributes, cls)
+            with refusals(archive, "parameters"):
+                parameters = archive.read("parameters")
+                n_weights = sum(tensor.numel() for tensor in parameters["policy"].values())
             if env is not None:
                 _check_env(env, attributes, archive)
                 attributes["n_envs"] = env.num_envs
@@ -169,7 +178,7 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
                     f"policy_kwargs are {saved} in {archive.name}; {kwargs['policy_kwargs']} do not fit its networks"
                 )
             own_settings = not kwargs  # what is wrong with settings from outside is not the file's fault
-            with refusals(archive, "attributes", own_settings):
+            with refusals(archive, "attributes", own_settings), at_most(n_weights):
                 model = cls(attributes["policy_class"], env, device=device, _init_setup_model=False)  # type: ignore[call-arg]
                 vars(model).update(attributes)
                 vars(model).update(kwargs)
@@ -177,31 +186,8 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
                     model.action_noise = model.action_noise.base_noise
                 model._setup_model()
             with refusals(archive, "parameters"):
-                parameters = archive.read("parameters")
                 OffPolicyAlgorithm.set_parameters(model, model.checked_parameters(parameters), device=device)
         return model
-
-    @classmethod
-    def _check_attributes(cls, attributes: Any, archive: Archive) -> None:
-        """
-        :raises ValueError: if these are not the attributes of such a model
-        """
-        needed = {"algorithm", "layout", "policy_class", "policy_kwargs", "observation_space", "action_space", "n_envs"}
-        if not isinstance(attributes, dict) or not needed <= set(attributes):
-            raise ValueError("they are not those of a model")
-        algorithm, layout = attributes["algorithm"], attributes["layout"]
-        if algorithm != cls.__name__:
-            raise FileFormatError(f"the model in {archive.name} was saved by {algorithm}; load it with {algorithm}.load")
-        shadowing = [name for name in attributes if hasattr(cls, name) and callable(getattr(cls, name))]
-        if shadowing:
-            raise ValueError(f"{shadowing[0]} is a method, no attribute")
-        width = layout.n_agents if layout.discrete else sum(layout.action_sizes)
-        kind = spaces.MultiDiscrete if layout.discrete else spaces.Box
-        spaces_fit = attributes["observation_space"].shape == (sum(layout.obs_sizes),) and (
-            isinstance(attributes["action_space"], kind) and attributes["action_space"].shape == (width,)
-        )
-        if not spaces_fit:
-            raise ValueError(f"its spaces do not fit its agents, {layout}")
 
     # ---- parameters
 
@@ -234,7 +220,7 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
         """
         target = with_suffix(path, ".zip") if isinstance(path, (str, pathlib.Path)) else path
         buffer = self.replay_buffer
-        sections = {"replay_buffer": self.replay_buffer_state(), "transitions": buffer.transitions()}
+        sections = {"replay_buffer": self.replay_buffer_state(), "transitions": packed(buffer.transitions())}
         write_archive(target, "replay buffer", sections)
 
     def replay_buffer_state(self) -> dict[str, Any]:
@@ -252,7 +238,7 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
         """
         source = with_suffix(path, ".zip") if isinstance(path, (str, pathlib.Path)) else path
         with open_archive(source, "replay buffer") as archive, refusals(archive, "replay_buffer"):
-            self.set_replay_buffer_state(archive.read("replay_buffer"), archive.read("transitions"))
+            self.set_replay_buffer_state(archive.read("replay_buffer"), unpacked(archive.read("transitions")))
 
     def set_replay_buffer_state(self, state: dict[str, Any], transitions: dict[str, np.ndarray]) -> None:
         """
@@ -261,10 +247,12 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
         :raises ValueError: if they are of another buffer
         """
         state = dict(state)
-        found = state.pop("class")
+        found = state.pop("class", None)
         if found is not type(self.replay_buffer):
             wanted = type(self.replay_buffer).__name__
-            raise ValueError(f"not a replay buffer of this model: it is a {found.__name__}, wanted is a {wanted}")
+            raise ValueError(
+                f"not a replay buffer of this model: it is a {getattr(found, '__name__', found)}, wanted is a {wanted}"
+            )
         self.replay_buffer.set_state(state, transitions)
 
 

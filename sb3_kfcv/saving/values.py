@@ -21,14 +21,21 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 from torch import nn
 
+from sb3_kfcv.common.checks import require_between, require_count, require_finite
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.naming import unknown_name
 
 # The key that marks a JSON object as something else than a plain map.
 TAG = "$"
 
-# Element types that arrays in a file may have: numbers and booleans.
+# Element types that arrays in a file may have: numbers and booleans, of at most 8 bytes.
 ARRAY_KINDS = "biuf"
+
+# Containers within containers: what is written can be read again, within Python's limit of calls.
+DEEPEST = 64
+
+# Bits of the largest whole number: Python reads no longer ones from text.
+LONGEST_INT = 14_000
 
 # Classes and functions by the name under which files and YAML know them.
 NAMES: dict[str, Any] = {
@@ -99,8 +106,10 @@ def encode(value: Any, place: str, store: Callable[[str, np.ndarray], str]) -> A
     def inner(item: Any, name: object) -> Any:
         return encode(item, f"{place}/{name}", store)
 
-    if value is None or type(value) in (bool, int, str):
+    if value is None or type(value) in (bool, str) or (type(value) is int and value.bit_length() < LONGEST_INT):
         return value
+    if place.count("/") > DEEPEST:
+        raise UnwritableError(f"{_inside(place)[:100]}… cannot be saved: containers within containers, too deeply")
     if type(value) is float:
         return value if math.isfinite(value) else {TAG: "float", "value": str(value)}
     if isinstance(value, pathlib.PurePath):
@@ -115,11 +124,11 @@ def encode(value: Any, place: str, store: Callable[[str, np.ndarray], str]) -> A
         return {TAG: "tuple", "items": [inner(item, i) for i, item in enumerate(value)]}
     if type(value) is deque:
         return {TAG: "deque", "items": [inner(item, i) for i, item in enumerate(value)], "maxlen": value.maxlen}
-    if isinstance(value, np.generic) and value.dtype.kind in ARRAY_KINDS:
+    if isinstance(value, np.generic) and _is_plain(value.dtype):
         return {TAG: "scalar", "dtype": value.dtype.str, "value": inner(value.item(), "value")}
-    if isinstance(value, np.ndarray) and value.dtype.kind in ARRAY_KINDS:
+    if type(value) in (np.ndarray, np.memmap) and _is_plain(value.dtype):
         return {TAG: "array", "name": store(place, value)}
-    if isinstance(value, th.Tensor) and (value.dtype == th.bool or value.dtype in _NUMPY_TENSORS):
+    if isinstance(value, th.Tensor) and value.dtype in _NUMPY_TENSORS and value.layout is th.strided:
         return {TAG: "tensor", "name": store(place, value.detach().cpu().numpy())}
     for name, thing in NAMES.items():
         if value is thing:
@@ -130,7 +139,16 @@ def encode(value: Any, place: str, store: Callable[[str, np.ndarray], str]) -> A
     what = getattr(value, "__qualname__", None) or f"an object of {type(value).__qualname__}"
     can_be_named = isinstance(value, type) or callable(value)
     hint = f'; give it a name with sb3_kfcv.register("{getattr(value, "__name__", "...")}", ...)' if can_be_named else ""
-    raise UnwritableError(f"{place.rpartition('attributes/')[2]} cannot be saved: it is {what}{hint}")
+    raise UnwritableError(f"{_inside(place)} cannot be saved: it is {what}{hint}")
+
+
+def _inside(place: str) -> str:
+    """A place without the name of the section."""
+    return place.rpartition("attributes/")[2]
+
+
+def _is_plain(dtype: np.dtype) -> bool:
+    return dtype.kind in ARRAY_KINDS and dtype.itemsize <= 8
 
 
 def decode(plain: Any, place: str, fetch: Callable[[str], np.ndarray]) -> Any:
@@ -146,10 +164,12 @@ def decode(plain: Any, place: str, fetch: Callable[[str], np.ndarray]) -> Any:
     def inner(item: Any, name: object) -> Any:
         return decode(item, f"{place}/{name}", fetch)
 
+    if type(plain) not in (list, dict):
+        return plain
+    if place.count("/") > DEEPEST:
+        raise ValueError("containers within containers, too deeply")
     if type(plain) is list:
         return [inner(item, i) for i, item in enumerate(plain)]
-    if type(plain) is not dict:
-        return plain
     if TAG not in plain:
         return {key: inner(item, key) for key, item in plain.items()}
     try:
@@ -160,7 +180,7 @@ def decode(plain: Any, place: str, fetch: Callable[[str], np.ndarray]) -> Any:
         if tag in KINDS:
             return KINDS[tag].make(**{key: inner(item, key) for key, item in fields.items()})
         raise ValueError(unknown_name("kind of value", tag, [*BUILT_IN, *KINDS]))
-    except (TypeError, KeyError, AttributeError, AssertionError, OverflowError, IndexError) as error:
+    except (TypeError, KeyError, AttributeError, AssertionError, ArithmeticError, IndexError) as error:
         raise ValueError(f"{place} is no value of the kind that it claims: {error}") from None
 
 
@@ -169,10 +189,10 @@ def _decode_map(inner: Callable[..., Any], _: Any, items: list[list[Any]]) -> di
 
 
 def _decode_number(inner: Callable[..., Any], _: Any, dtype: str, value: Any) -> np.generic:
-    kind = np.dtype(dtype)
-    if kind.kind not in ARRAY_KINDS:
-        raise ValueError(f"{dtype!r} is no number type")
-    return kind.type(inner(value, "value"))
+    kind, number = np.dtype(str(dtype)), inner(value, "value")
+    if not _is_plain(kind) or type(number) not in (bool, int, float):
+        raise ValueError(f"{number!r} is no number of type {dtype!r}")
+    return kind.type(number)
 
 
 def _decode_deque(inner: Callable[..., Any], _: Any, items: list[Any], maxlen: int | None) -> deque[Any]:
@@ -203,29 +223,86 @@ BUILT_IN: dict[str, Callable[..., Any]] = {
     "name": _decode_name,
 }
 
-_NUMPY_TENSORS = (th.float32, th.float64, th.float16, th.uint8, th.int8, th.int16, th.int32, th.int64)
+_NUMPY_TENSORS = (th.bool, th.float32, th.float64, th.float16, th.uint8, th.int8, th.int16, th.int32, th.int64)
 
 
 def _make_box(low: np.ndarray, high: np.ndarray) -> spaces.Box:
+    if low.dtype != high.dtype or low.shape != high.shape or not (low <= high).all():  # NaN is not <= either
+        raise ValueError("the bounds of a Box must be as many, of one type, and the lower below the higher")
     return spaces.Box(low, high, dtype=low.dtype.type)
 
 
+def _make_multi_discrete(nvec: np.ndarray) -> spaces.MultiDiscrete:
+    if nvec.dtype.kind != "i":
+        raise ValueError(f"numbers of choices are whole, not {nvec.dtype}")
+    return spaces.MultiDiscrete(nvec, dtype=nvec.dtype.type)
+
+
+def _make_layout(**fields: Any) -> AgentLayout:
+    layout = AgentLayout.from_dict(fields)
+    agents, groups = layout.agents, layout.groups
+    columns = (agents, groups, layout.obs_sizes, layout.action_sizes)
+    if any(type(column) is not tuple or len(column) != len(agents) for column in columns) or not agents:
+        raise ValueError("a layout needs a name, a group, and sizes for each agent")
+    if not all(type(name) is str for name in (*agents, *groups)) or len(set(agents)) < len(agents):
+        raise ValueError(f"names of agents must be texts, each another: {agents}, {groups}")
+    for size in (*layout.obs_sizes, *layout.action_sizes):
+        require_count("a size in the layout", size, least=0)
+    require_count("state_size", layout.state_size, least=0)
+    if type(layout.discrete) is not bool:
+        raise ValueError(f"discrete is yes or no, not {layout.discrete!r}")
+    return layout
+
+
+def _make_train_freq(frequency: int, unit: str) -> TrainFreq:
+    require_count("frequency", frequency)
+    return TrainFreq(frequency, TrainFrequencyUnit(unit))
+
+
+def _make_constant(val: float) -> ConstantSchedule:
+    _require_numbers(val=val)
+    return ConstantSchedule(val)
+
+
+def _make_linear(start: float, end: float, end_fraction: float) -> LinearSchedule:
+    _require_numbers(start=start, end=end)
+    require_between("end_fraction", end_fraction, 0, 1, above=True)
+    return LinearSchedule(start, end, end_fraction)
+
+
 def _make_noise(mean: np.ndarray, sigma: np.ndarray, dtype: type) -> NormalActionNoise:
+    _require_numbers(mean=mean, sigma=sigma)
+    if not (np.asarray(sigma) >= 0).all() or np.dtype(dtype).kind != "f":
+        raise ValueError(f"no noise has a spread of {sigma} and the type {dtype}")
     return NormalActionNoise(mean, sigma, dtype)
 
 
-def _make_ornstein_uhlenbeck(noise_prev: np.ndarray, **fields: Any) -> OrnsteinUhlenbeckActionNoise:
-    noise = OrnsteinUhlenbeckActionNoise(**fields)
-    if noise_prev.shape != noise.noise_prev.shape:
-        raise ValueError(f"a noise of {noise.noise_prev.shape} numbers cannot stand at {noise_prev.shape}")
+def _make_ornstein_uhlenbeck(noise_prev: np.ndarray, mean: np.ndarray, **fields: Any) -> OrnsteinUhlenbeckActionNoise:
+    numbers = {name: value for name, value in fields.items() if name != "dtype" and value is not None}
+    _require_numbers(mean=mean, noise_prev=noise_prev, **numbers)
+    noise = OrnsteinUhlenbeckActionNoise(mean, **fields)
+    if np.shape(noise_prev) != np.shape(noise.noise_prev) or np.dtype(noise._dtype).kind != "f":
+        raise ValueError(f"a noise of {np.shape(noise.noise_prev)} numbers cannot stand at {np.shape(noise_prev)}")
     noise.noise_prev = noise_prev
     return noise
 
 
 def _make_vectorized(base_noise: Any, noises: list[Any]) -> VectorizedActionNoise:
-    made = VectorizedActionNoise(base_noise, len(noises))
-    made._noises = list(noises)  # the setter would reset them
+    made = VectorizedActionNoise(base_noise, 1)  # would copy it as often as it is told
+    if not noises or any(type(noise) is not type(base_noise) for noise in noises):
+        raise ValueError("the noises of the worlds must be of one kind")
+    made.n_envs, made._noises = len(noises), list(noises)  # the setter would reset them
     return made
+
+
+def _require_numbers(**values: Any) -> None:
+    """
+    :raises ValueError: unless they are finite numbers, or arrays of such
+    """
+    for name, value in values.items():
+        if type(value) not in (int, float, np.ndarray) and not isinstance(value, np.generic):
+            raise ValueError(f"{name} must be numbers, got {value!r}")
+        require_finite(name, np.asarray(value, dtype=float))
 
 
 register_kind("Box", spaces.Box, lambda box: {"low": box.low, "high": box.high}, _make_box)
@@ -233,17 +310,17 @@ register_kind(
     "MultiDiscrete",
     spaces.MultiDiscrete,
     lambda space: {"nvec": space.nvec},
-    lambda nvec: spaces.MultiDiscrete(nvec, dtype=nvec.dtype.type),
+    _make_multi_discrete,
 )
-register_kind("AgentLayout", AgentLayout, AgentLayout.to_dict, lambda **fields: AgentLayout.from_dict(fields))
+register_kind("AgentLayout", AgentLayout, AgentLayout.to_dict, _make_layout)
 register_kind(
     "TrainFreq",
     TrainFreq,
     lambda f: {"frequency": f.frequency, "unit": f.unit.value},
-    lambda frequency, unit: TrainFreq(frequency, TrainFrequencyUnit(unit)),
+    _make_train_freq,
 )
-register_kind("ConstantSchedule", ConstantSchedule, vars, ConstantSchedule)
-register_kind("LinearSchedule", LinearSchedule, vars, LinearSchedule)
+register_kind("ConstantSchedule", ConstantSchedule, vars, _make_constant)
+register_kind("LinearSchedule", LinearSchedule, vars, _make_linear)
 register_kind(
     "NormalActionNoise",
     NormalActionNoise,

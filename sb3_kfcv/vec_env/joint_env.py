@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from sb3_kfcv.common.checks import require_finite, require_finite_columns
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.vec_env.scalar_reward import scalar_weights
 
@@ -26,7 +27,8 @@ class JointEnv(gym.Env):
                               mean over the group's agents; each stands in the info by its own name, too
     ========================  =======================================================================================
 
-    The observation of an agent that is gone is zeros.
+    The observation of an agent that is gone is zeros. An observation, reward or state that is infinite or NaN raises
+    :class:`~sb3_kfcv.common.checks.NonFiniteError` with the name of the agent, before anything learns from it.
 
     :param env: the parallel env
     :param reward: the scalar: ``"mean"`` or ``"sum"`` over all agents, the mean of a group by its name, or
@@ -47,6 +49,8 @@ class JointEnv(gym.Env):
             if self.layout.discrete
             else joint_box([action_spaces[agent] for agent in agents])
         )
+        self._columns = dict(zip(agents, self.layout.obs_slices, strict=True))
+        self._places = {agent: slice(i, i + 1) for i, agent in enumerate(agents)}
         self._weights = scalar_weights(self.layout, getattr(env, "scalar_reward", "mean") if reward == "default" else reward)
         self._world_metrics = tuple(getattr(env, "metric_names", ()))
         self.metric_names = (*self._world_metrics, *(f"return_{group}" for group in self.layout.group_names))
@@ -68,6 +72,7 @@ class JointEnv(gym.Env):
         chosen = self._split(np.asarray(action))
         observations, rewards, terminations, _, _ = env.step({agent: chosen[agent] for agent in env.agents})
         agent_rewards = np.array([rewards.get(agent, 0.0) for agent in names], dtype=np.float32)
+        require_finite_columns("reward", agent_rewards, self._places)
         present = np.array([agent in env.agents for agent in names])
         self._gone = (self._gone | [bool(terminations.get(agent, False)) for agent in names]) & ~present
         self._returns += agent_rewards
@@ -111,6 +116,7 @@ class JointEnv(gym.Env):
         for agent, columns, gone in zip(self.layout.agents, self.layout.obs_slices, self._gone, strict=True):
             if agent in observations and not gone:
                 row[columns] = observations[agent]
+        require_finite_columns("observation", row, self._columns)
         return row
 
     def _split(self, action: np.ndarray) -> dict[str, Any]:
@@ -121,7 +127,11 @@ class JointEnv(gym.Env):
         return {agent: action[columns] for agent, columns in zip(self.layout.agents, self.layout.action_slices, strict=True)}
 
     def _read_state(self) -> np.ndarray | None:
-        return np.array(self.parallel_env.state(), dtype=np.float32).ravel() if self.layout.state_size else None
+        if not self.layout.state_size:
+            return None
+        state = np.array(self.parallel_env.state(), dtype=np.float32).ravel()
+        require_finite("the world's state", state)
+        return state
 
     def _metrics(self) -> dict[str, float]:
         own = self.parallel_env.episode_metrics() if self._world_metrics else {}
