@@ -81,7 +81,7 @@ class _Chain(th.autograd.Function):
         :param from_first: whether the first layer is part of it
         :param parameters: those that get a gradient; none for frozen networks
         """
-        hidden = []
+        hidden: list[th.Tensor] = []
         z = stack._spread(stack.first(x)) if from_first else x
         for layer in stack.rest:
             hidden.append(z.relu_() if hidden or from_first else z.relu())

@@ -280,7 +280,8 @@ class MADDPG(SaveableAlgorithm):
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
         networks = (self.actor, self.actor_target, self.critic, self.critic_target)
-        self._parameters = {network: list(network.parameters()) for network in networks}  # asked for at every update
+        # Asked for at every update, and slow to gather.
+        self._parameters: dict[nn.Module, list[nn.Parameter]] = {network: list(network.parameters()) for network in networks}
 
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
         """
