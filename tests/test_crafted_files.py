@@ -49,6 +49,7 @@ from sb3_kfcv.saving import values
 from sb3_kfcv.saving.archive import MANIFEST
 from sb3_kfcv.saving.checkpoints import Checkpoint
 from sb3_kfcv.saving.normalization import load_normalization
+from sb3_kfcv.saving.run_state import random_state, set_random_state
 
 ROOT = Path(__file__).resolve().parents[1]
 MODEL_FILES = ("model", "buffer", "checkpoint")
@@ -588,6 +589,15 @@ def test_crafted_checkpoints_are_refused(runs, edits):
         Checkpoint(path)
     assert str(caught.value).startswith(str(path.parent))
     path.unlink()
+
+
+@pytest.mark.parametrize("pos", [2**31 - 1, 625, -1, "1"])
+def test_a_generator_beyond_its_numbers_is_refused(trained, pos):
+    """NumPy would read on behind them."""
+    state = random_state(trained["kfcv"])
+    state["numpy"]["state"]["pos"] = pos
+    with pytest.raises(ValueError, match="NumPy's generator"):
+        set_random_state(trained["kfcv"], state)
 
 
 # ---- statistics of normalised worlds

@@ -550,12 +550,15 @@ def test_an_older_damaged_checkpoint_harms_nobody(whole, cut):
     assert_equal_runs(whole, cut)
 
 
-def test_without_a_whole_checkpoint_the_run_begins_again(whole, cut):
-    shutil.rmtree(cut.path / "transitions")
-    with pytest.warns(UserWarning, match=r"no checkpoint in .* is whole: the training starts from the beginning"):
-        assert resume(cut, [KillAt(NEVER)]) == 0
-    assert len(list(cut.path.glob("*.damaged"))) == 3
-    assert_equal_runs(whole, cut)
+def test_without_a_whole_checkpoint_nothing_is_touched(cut, capsys):
+    """A lost folder hits all checkpoints at once, and may come back."""
+    (cut.path / "transitions").rename(cut.path / "elsewhere")
+    before = {path: path.read_bytes() for path in cut.path.rglob("*") if path.is_file()}
+    assert resume(cut) == 2
+    assert re.match(
+        r"error: no checkpoint in .* is whole, so nothing can be gone on with: .*, which is missing\n", capsys.readouterr().err
+    )
+    assert {path: path.read_bytes() for path in cut.path.rglob("*") if path.is_file()} == before
 
 
 def test_a_run_without_a_checkpoint_begins_again_with_empty_logs(whole, cut):

@@ -11,6 +11,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -30,7 +31,7 @@ from sb3_kfcv.common.checks import NonFiniteError
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.patient_logs import PatientResultsWriter
 from sb3_kfcv.maddpg import MADDPG
-from sb3_kfcv.saving.checkpoints import Checkpoints, checkpoints_in, latest_checkpoint
+from sb3_kfcv.saving.checkpoints import Checkpoints, ResumeError, checkpoints_in, latest_checkpoint
 from sb3_kfcv.saving.normalization import load_normalization
 from sb3_kfcv.vec_env.make import layout_of, make_vec_env, metric_names_of
 from zoo.hyperparams import (
@@ -49,6 +50,9 @@ BAD_INPUT = 2  # exit status, as of argparse
 NOT_FINITE = 3  # a loss, reward, observation or action was infinite or NaN
 NOT_WRITTEN = 4  # the training came to its end, but its model could not be written
 SIGNALLED = 128  # plus the number of the signal: 130 after Ctrl-C, 143 after SIGTERM
+
+# What is wrong before the training begins is told in one sentence.
+REFUSALS = (ValueError, MemoryError, gym.error.Error)
 
 # Worlds of the evaluation are seeded this far above those of the training, which are seed, seed + 1, …
 EVAL_SEED_OFFSET = 1_000_000
@@ -176,6 +180,7 @@ def resolve(args: argparse.Namespace) -> Hyperparams:
         model_path = Path(args.trained_agent)
         if not model_path.is_file():
             raise ValueError(f"there is no model {model_path}")
+        args.trained_agent = str(model_path.resolve())  # the run may be resumed from elsewhere
         continue_as_begun(args, model_path)
         config = RunFolder.of_model(model_path, args.env).config_file
         if config.exists():
@@ -384,6 +389,9 @@ def train(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseC
             )
         except KeyboardInterrupt:
             return SIGNALLED + (stop.received or StopOnSignal.SIGNALS[0])
+        except ResumeError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return BAD_INPUT
         except NonFiniteError as error:
             print(f"error: {error}; the training has stopped after {model.num_timesteps:,} env steps", file=sys.stderr)
             return NOT_FINITE
@@ -427,12 +435,12 @@ def main(argv: Sequence[str] | None = None, extra_callbacks: Sequence[BaseCallba
     words = [interpreter(), "zoo/train.py", *(sys.argv[1:] if argv is None else argv)]
     try:
         args = make_parser().parse_all(argv)
-        if args.resume is not None:
-            return resume_run(args, extra_callbacks)
-        training = build(args)
-    except (ValueError, MemoryError, gym.error.Error) as error:
+        training = build(args) if args.resume is None else None
+    except REFUSALS as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_INPUT
+    if training is None:
+        return resume_run(args, extra_callbacks)
     try:
         folder = RunFolder.create(args.log_folder, args.algo, args.env)
         folder.describe(training.hyperparams.to_dict(), vars(args), shlex.join(words))
@@ -453,19 +461,21 @@ def resume_run(args: argparse.Namespace, extra_callbacks: Sequence[BaseCallback]
     :param args: the command line
     :param extra_callbacks: see :func:`main`
     :return: exit status
-    :raises ValueError: if it cannot be
     """
     parser = make_parser()
     given = [name for name, value in vars(args).items() if value != parser.get_default(name)]
-    begun, folder = as_begun(args, given)
-    with folder.locked():
-        changed = folder.versions_changed()
+    with ExitStack() as stack:
+        try:
+            begun, folder = as_begun(args, given)
+            stack.enter_context(folder.locked())
+            changed = folder.versions_changed()
+            latest_checkpoint(folder.path)  # sets aside what is damaged
+            training = build(begun, folder)
+        except REFUSALS as error:
+            print(f"error: {error}", file=sys.stderr)
+            return BAD_INPUT
         if changed:
-            print(
-                f"note: {', '.join(changed)} since the run was begun: it goes on, but perhaps not bit for bit", file=sys.stderr
-            )
-        latest_checkpoint(folder.path)  # sets aside what is damaged
-        training = build(begun, folder)
+            print(f"note: {', '.join(changed)} since the run was begun: perhaps not bit for bit", file=sys.stderr)
         print(f"{begun.algo} on {begun.env}, seed {begun.seed}, goes on in {folder.path}")
         return run(training, folder, extra_callbacks)
 

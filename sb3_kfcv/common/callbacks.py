@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import time
 from pathlib import Path
 from types import FrameType
@@ -35,6 +36,8 @@ class MultiAgentEvalCallback(EventCallback):
     :param callback_after_eval: called after each evaluation
     :param verbose: 1 prints the results
     """
+
+    KEPT = ("n_calls", "best_mean_reward", "last_mean_reward", "timesteps", "_next")
 
     def __init__(
         self,
@@ -92,10 +95,26 @@ class MultiAgentEvalCallback(EventCallback):
     def arrays(self) -> dict[str, np.ndarray]:
         """All evaluations so far, as in ``evaluations.npz``."""
         names = {"reward": "results", "length": "ep_lengths"}
-        stacked = {
-            names.get(name, name): np.stack([episodes[name] for episodes in self.evaluations]) for name in self.evaluations[0]
+        return {
+            "timesteps": np.array(self.timesteps),
+            **{names.get(name, name): values for name, values in self._stacked().items()},
         }
-        return {"timesteps": np.array(self.timesteps), **stacked}
+
+    def _stacked(self) -> dict[str, np.ndarray]:
+        """Every metric of all evaluations: (evaluations, episodes)."""
+        names = self.evaluations[0] if self.evaluations else ()
+        return {name: np.stack([episodes[name] for episodes in self.evaluations]) for name in names}
+
+    def get_state(self) -> dict[str, Any]:
+        """All results so far, and when the next evaluation is due."""
+        return {**{name: getattr(self, name) for name in self.KEPT}, "evaluations": self._stacked()}
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Inverse of :meth:`get_state`."""
+        for name in self.KEPT:
+            setattr(self, name, saved[name])
+        by_name = saved["evaluations"]
+        self.evaluations = [{name: values[i] for name, values in by_name.items()} for i in range(len(self.timesteps))]
 
     def _write(self) -> None:
         if self.log_path is not None:
@@ -150,6 +169,8 @@ class StopOnSignal(BaseCallback):
         if self.received is not None:
             raise KeyboardInterrupt
         self.received = number
+        name = signal.Signals(number).name
+        print(f"{name}: the training stops after the step in hand; once more stops at once", file=sys.stderr, flush=True)
 
     def _on_rollout_start(self) -> None:
         self.ending = self.received is not None

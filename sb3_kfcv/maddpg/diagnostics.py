@@ -80,12 +80,12 @@ class Diagnostics:
             "update_seconds": self.update_seconds,
         }
 
-    def set_state(self, saved: dict[str, Any]) -> None:
-        """Inverse of :meth:`get_state`."""
+    def set_state(self, saved: dict[str, Any], device: th.device) -> None:
+        """Inverse of :meth:`get_state`; what is noted goes to the device of the learner."""
         for name, noted in self._noted().items():
             noted.clear()
-            noted.extend(() if saved[name] is None else saved[name].unbind())
-        self._own_actions, self._norms = list(saved["own_actions"]), dict(saved["norms"])
+            noted.extend(() if saved[name] is None else saved[name].to(device).unbind())
+        self._own_actions, self._norms = [actions.to(device) for actions in saved["own_actions"]], dict(saved["norms"])
         self.update_seconds = float(saved["update_seconds"])
 
     def _noted(self) -> dict[str, deque[th.Tensor]]:

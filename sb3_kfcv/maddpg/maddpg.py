@@ -553,7 +553,7 @@ class MADDPG(SaveableAlgorithm):
         return {"watch": self._watch.get_state(self.actor, self.critic), "opponents": opponents}
 
     def set_training_state(self, saved: dict[str, Any]) -> None:
-        self._watch.set_state(saved["watch"])
+        self._watch.set_state(saved["watch"], self.device)
         if self._opponent_policy is not None:
             self._opponent_policy.set_state(saved["opponents"])
 

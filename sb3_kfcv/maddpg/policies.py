@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.layout import AgentLayout
-from sb3_kfcv.common.stacked_networks import StackedMLP
+from sb3_kfcv.common.stacked_networks import StackedMLP, at_most
 from sb3_kfcv.saving.archive import open_archive, write_archive
 from sb3_kfcv.saving.parameters import check_network
 from sb3_kfcv.saving.saveable import refusals
@@ -521,10 +521,12 @@ class MADDPGPolicy(BasePolicy):
         :raises FileFormatError: if the file is damaged, or none of these
         """
         with open_archive(path, "policy") as archive:
-            with refusals(archive, "constructor"):
-                policy = cls(**archive.read("constructor"))
             with refusals(archive, "parameters"):
                 parameters = archive.read("parameters")
+                n_weights = sum(tensor.numel() for tensor in parameters.values())
+            with refusals(archive, "constructor"), at_most(n_weights):
+                policy = cls(**archive.read("constructor"))
+            with refusals(archive, "parameters"):
                 check_network(policy, parameters, "parameters")
                 policy.load_state_dict(parameters)
         return policy.to(get_device(device))

@@ -7,7 +7,7 @@ each checkpoint writes only those that came since the last one, into a file of t
 buffer is made of::
 
     rl_model_<N>_steps.zip             checkpoint after N env steps; a model file, too
-    transitions/<first>_<last>.zip     the transitions of these steps
+    transitions/<first>_<last>.zip     the transitions of these steps of the vec env
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
 from sb3_kfcv.saving.archive import Archive, FileFormatError, open_archive, write_archive
+from sb3_kfcv.saving.attributes import check_attributes
 from sb3_kfcv.saving.files import going_on
 from sb3_kfcv.saving.run_state import (
     UnreadableEnvError,
@@ -56,6 +57,10 @@ FREE_SETTINGS = (
 )
 
 
+class ResumeError(ValueError):
+    """A checkpoint is of another training than the one that is to go on."""
+
+
 def checkpoints_in(folder: str | Path) -> dict[int, Path]:
     """The checkpoints of a folder by their number of env steps, the latest first; whole or not."""
     found = {int(match.group(1)): path for path in Path(folder).glob("*") if (match := NAME.fullmatch(path.name))}
@@ -64,20 +69,25 @@ def checkpoints_in(folder: str | Path) -> dict[int, Path]:
 
 def latest_checkpoint(folder: str | Path) -> Checkpoint | None:
     """
-    The latest checkpoint of a folder that is whole. A damaged one is named in a warning and set aside as ``*.damaged``.
+    The latest checkpoint of a folder that is whole. Damaged later ones are named in a warning and set aside as ``*.damaged``.
 
     :param folder: of a training
-    :return: ``None`` if there is none
+    :return: ``None`` if there is no checkpoint
+    :raises FileFormatError: if there are some and none is whole; they stay as they are
     """
-    found = checkpoints_in(folder)
-    for steps, path in found.items():
+    damaged: list[tuple[int, Path, FileFormatError]] = []
+    for steps, path in checkpoints_in(folder).items():
         try:
-            return Checkpoint(path)
-        except (FileFormatError, OSError) as error:
-            aside = path.replace(path.with_name(f"{path.name}.damaged"))
-            warnings.warn(f"the checkpoint after {steps:,} env steps is of no use, and set aside as {aside.name}: {error}")
-    if found:
-        warnings.warn(f"no checkpoint in {folder} is whole: the training starts from the beginning")
+            checkpoint = Checkpoint(path)
+        except FileFormatError as error:
+            damaged.append((steps, path, error))
+            continue
+        for later, its_path, reason in damaged:
+            aside = its_path.replace(its_path.with_name(f"{its_path.name}.damaged"))
+            warnings.warn(f"the checkpoint after {later:,} env steps is of no use, and set aside as {aside.name}: {reason}")
+        return checkpoint
+    if damaged:
+        raise FileFormatError(f"no checkpoint in {folder} is whole, so nothing can be gone on with: {damaged[0][2]}")
     return None
 
 
@@ -344,12 +354,15 @@ class Checkpoints(BaseCallback):
 
     def _restore_model(self, checkpoint: Checkpoint) -> None:
         """
-        :raises ValueError: if the model is not the one that the checkpoint was written by
+        :raises ResumeError: if the model is not the one that the checkpoint was written by
         """
         self._check_settings(checkpoint)
         model, attributes = self.model, dict(checkpoint.attributes)
+        attributes.setdefault("action_noise", None)
         for name in ("algorithm", "verbose", "tensorboard_log", "opponents", "_total_timesteps"):
             attributes.pop(name, None)
+        with refusals(checkpoint, "attributes"):
+            check_attributes(attributes, type(model))
         with refusals(checkpoint, "parameters"):
             model.set_parameters(model.checked_parameters(checkpoint.parameters))
         with refusals(checkpoint, "replay_buffer"):
@@ -363,14 +376,14 @@ class Checkpoints(BaseCallback):
         model, saved = self.model, checkpoint.attributes
         algorithm = type(model).__name__
         if saved["algorithm"] != algorithm:
-            raise ValueError(f"{checkpoint.path} is of {saved['algorithm']}; this model is a {algorithm}")
+            raise ResumeError(f"{checkpoint.path} is of {saved['algorithm']}; this model is a {algorithm}")
         if saved["layout"] != model.layout:
-            raise ValueError(f"{checkpoint.path} is of another world: {saved['layout']}; this model's has {model.layout}")
+            raise ResumeError(f"{checkpoint.path} is of another world: {saved['layout']}; this model's has {model.layout}")
         names = [name for name in inspect.signature(type(model)).parameters if name not in FREE_SETTINGS]
         for name in ("n_envs", *names):
             if name in saved and _comparable(saved[name]) != _comparable(getattr(model, name)):
                 ours = getattr(model, name)
-                raise ValueError(f"{checkpoint.path} was written with {name}={saved[name]}; this model has {name}={ours}")
+                raise ResumeError(f"{checkpoint.path} was written with {name}={saved[name]}; this model has {name}={ours}")
 
     def _restore_training(self, checkpoint: Checkpoint) -> None:
         """Everything beside the model, as late as can be: nothing is drawn between here and the next step."""

@@ -25,6 +25,7 @@ from stable_baselines3.common.logger import TensorBoardOutputFormat
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
+from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.saving.normalization import normalization_state, set_normalization_state
 from sb3_kfcv.saving.values import UnwritableError, check_writable
 from sb3_kfcv.vec_env.joint_env import JointEnv
@@ -49,6 +50,10 @@ def set_random_state(model: BaseAlgorithm, state: dict[str, Any]) -> None:
     """Inverse of :func:`random_state`."""
     python = state["python"]
     random.setstate((python["version"], tuple(python["internal"].tolist()), python["gauss"]))
+    pos, key = state["numpy"]["state"]["pos"], state["numpy"]["state"]["key"]
+    require_count("the place in NumPy's generator", pos, least=0)  # NumPy itself would read beyond its memory
+    if pos > len(key) or key.shape != (624,):
+        raise ValueError(f"NumPy's generator has 624 numbers; this one stands at {pos} of {key.shape}")
     np.random.set_state(state["numpy"])
     th.set_rng_state(state["torch"])
     if th.cuda.is_available() and state["cuda"]:
