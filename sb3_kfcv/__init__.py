@@ -10,6 +10,7 @@ from sb3_kfcv.per_maddpg import PERMADDPG
 from sb3_kfcv.replay import JointReplayBuffer, PrioritizedReplayBuffer
 from sb3_kfcv.saving import FileFormatError, register
 from sb3_kfcv.saving.checkpoints import Checkpoints
+from sb3_kfcv.saving.normalization import load_normalization
 from sb3_kfcv.vec_env import JointEnv, ParticleVecEnv, make_vec_env
 from sb3_kfcv.vec_env.make import WORLDS
 from sb3_kfcv.version import __version__
@@ -35,6 +36,7 @@ __all__ = [
     "KFCVReplayBuffer",
     "ParticleVecEnv",
     "__version__",
+    "load_normalization",
     "make_vec_env",
     "register",
 ]

@@ -376,9 +376,9 @@ def test_a_run_stops_in_a_sentence_and_says_how_it_goes_on(algo, env_kwargs, sen
     assert sentence in printed.err and "the training has stopped after" in printed.err
     folder = run_folder(tmp_path, "Poisoned-v0", algo)
     assert max(checkpoints_in(folder.path)) == latest_checkpoint(folder.path).steps >= last
-    assert f"the last checkpoint is of {max(checkpoints_in(folder.path))} env steps; to go on: " in printed.out
-    words = shlex.split(printed.out.rpartition("to go on: ")[2])
-    assert words[-2:] == ["--resume", str(folder.path)]
+    assert f"the last checkpoint is of {max(checkpoints_in(folder.path))} env steps; to train it on with " in printed.out
+    words = shlex.split(printed.out.rpartition("other settings: ")[2])  # the same ones would end alike
+    assert words[-6:] == ["-i", str(latest_checkpoint(folder.path).path), "-n", "STEPS", "-params", "NAME:VALUE"]
     assert not folder.last_model.exists()
 
 

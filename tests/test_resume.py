@@ -18,6 +18,7 @@ import sys
 import time
 import zipfile
 from contextlib import contextmanager
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -817,6 +818,9 @@ def has_stepped(run):
     return run.monitor_file.exists() and len(run.monitor_file.read_text().splitlines()) > 2
 
 
+SAID = "{}: the training stops after the step in hand; once more stops at once\n"
+
+
 def test_a_process_that_was_told_to_stop_and_then_killed_goes_on_exactly(tmp_path):
     words = {name: [*command(tmp_path / name, steps=400), "--save-freq", "20"] for name in ("whole", "cut")}
     whole, cut = (run_folder(tmp_path / name) for name in ("whole", "cut"))
@@ -825,13 +829,13 @@ def test_a_process_that_was_told_to_stop_and_then_killed_goes_on_exactly(tmp_pat
     wait_until(process, lambda: has_stepped(cut))
     process.send_signal(signal.SIGTERM)
     printed, errors = process.communicate()
-    assert (process.returncode, errors) == (143, "")
+    assert (process.returncode, errors) == (143, SAID.format("SIGTERM"))
     stopped = max(checkpoints_in(cut.path))
     assert f"stopped: the last checkpoint is of {stopped:,} env steps; to go on: " in printed
     killer = Killer(tmp_path / "cut", words["cut"], seed=0, start_up=2, steps=60)
     assert all(killer.kill(when) for when in ("training", "writing"))
     _, script, *again = shlex.split(printed.rpartition("to go on: ")[2])
-    assert (script, train.main(again)) == ("zoo/train.py", 0)
+    assert (Path(script).resolve(), train.main(again)) == (Path(train.__file__).resolve(), 0)
     assert_equal_runs(whole, cut)
     print(killer.counts)
 
@@ -847,7 +851,7 @@ def test_a_second_interrupt_stops_a_long_evaluation_at_once(tmp_path):
     told = time.monotonic()
     printed, errors = process.communicate()
     assert time.monotonic() - told < 3
-    assert (process.returncode, errors) == (130, "")
+    assert (process.returncode, errors) == (130, SAID.format("SIGINT"))
     assert "stopped: no checkpoint was saved yet; to start again: " in printed
 
 
@@ -883,3 +887,17 @@ def test_a_long_run_takes_no_more_memory(tmp_path):
     grown = (used[100_000] - used[20_000]) / 2**20
     print(f"{used[20_000] / 2**20:.1f} MB after 20,000 env steps, {grown:+.2f} MB after 80,000 more")
     assert grown < 5
+
+
+def test_worlds_of_other_settings_are_refused(tmp_path):
+    """Even where the agents are the same: the training would mix two worlds."""
+
+    def learn(steps, **settings):
+        env = make_vec_env("HardSpread-v0", 2, seed=0, env_kwargs={"n_agents": 2, "max_steps": 5, **settings})
+        model = MADDPG("MlpPolicy", env, learning_starts=10, buffer_size=50, batch_size=8, seed=1)
+        model.learn(steps, Checkpoints(tmp_path / "run", save_freq=20, resume=True))
+
+    learn(20)
+    with pytest.raises(ValueError, match=r"made with max_steps=5; these have max_steps=6"):
+        learn(60, max_steps=6)
+    learn(60)

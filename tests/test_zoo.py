@@ -168,7 +168,7 @@ def test_a_stopped_run_prints_how_it_goes_on(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "the last checkpoint is of 100 env steps" in printed
     python, script, *words = shlex.split(printed.rpartition("to go on: ")[2])
-    assert (Path(python).absolute(), script) == (Path(sys.executable), "zoo/train.py")
+    assert (Path(python).absolute(), Path(script).resolve()) == (Path(sys.executable), Path(train.__file__).resolve())
     assert not run_folder(tmp_path).last_model.exists()
 
     assert train.main(words) == 0

@@ -285,6 +285,8 @@ def build(args: argparse.Namespace, resumed: RunFolder | None = None) -> Trainin
     """
     if args.num_threads < 1:
         raise ValueError(f"--num-threads is {args.num_threads}; it must be at least 1")
+    if args.save_freq < 1 and args.save_freq != -1:
+        raise ValueError(f"--save-freq is {args.save_freq}; it must be at least 1, or -1")
     if args.keep_checkpoints == 0:
         raise ValueError("--keep-checkpoints is 0; it must be at least 1, or -1 to keep all")
     hyperparams = check(args.algo, args.env, read_map(resumed.config_file)) if resumed else resolve(args)
@@ -408,19 +410,28 @@ def train(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseC
     return 0
 
 
-def interpreter() -> str:
-    """This Python as one types it: from the working directory where it lies below it."""
-    path = Path(sys.executable)
+def as_typed(path: Path) -> str:
+    """A path from the working directory, where it lies below it."""
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
 
 
-def what_is_left(folder: RunFolder) -> str:
+def this_script() -> list[str]:
+    """This Python and this script, as one types them."""
+    return [as_typed(Path(sys.executable)), as_typed(Path(__file__).resolve())]
+
+
+def what_is_left(training: Training, folder: RunFolder, status: int) -> str:
     """What a run that did not come to its end leaves behind, and how it goes on."""
     checkpoints = checkpoints_in(folder.path)
-    resume = shlex.join([interpreter(), "zoo/train.py", "--resume", str(folder.path)])
+    resume = shlex.join([*this_script(), "--resume", str(folder.path)])
     if not checkpoints:
         return f"no checkpoint was saved yet; to start again: {resume}"
-    return f"the last checkpoint is of {max(checkpoints):,} env steps; to go on: {resume}"
+    steps, path = next(iter(checkpoints.items()))
+    if status == NOT_FINITE:  # the same would come again
+        of = ["--algo", training.args.algo, "--env", training.args.env]
+        other = shlex.join([*this_script(), *of, "-i", str(path), "-n", "STEPS", "-params", "NAME:VALUE"])
+        return f"the last checkpoint is of {steps:,} env steps; to train it on with other settings: {other}"
+    return f"the last checkpoint is of {steps:,} env steps; to go on: {resume}"
 
 
 def main(argv: Sequence[str] | None = None, extra_callbacks: Sequence[BaseCallback] = ()) -> int:
@@ -432,7 +443,7 @@ def main(argv: Sequence[str] | None = None, extra_callbacks: Sequence[BaseCallba
     :return: exit status: 0; 2 for bad input; 3 for a number that is not finite; 4 if the model could not be written at the
         end; 130 after Ctrl-C, 143 after SIGTERM
     """
-    words = [interpreter(), "zoo/train.py", *(sys.argv[1:] if argv is None else argv)]
+    words = [*this_script(), *(sys.argv[1:] if argv is None else argv)]
     try:
         args = make_parser().parse_all(argv)
         training = build(args) if args.resume is None else None
@@ -489,9 +500,13 @@ def run(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseCal
         return BAD_INPUT
     status = train(training, folder, extra_callbacks)
     if status:
-        print(f"stopped: {what_is_left(folder)}")
+        print(f"stopped: {what_is_left(training, folder, status)}")
     return status
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        print("interrupted before the training began", file=sys.stderr)
+        sys.exit(SIGNALLED + StopOnSignal.SIGNALS[0])

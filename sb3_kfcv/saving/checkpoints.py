@@ -21,6 +21,7 @@ from typing import Any, NoReturn
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
+from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.saving.archive import Archive, FileFormatError, open_archive, write_archive
 from sb3_kfcv.saving.attributes import check_attributes
 from sb3_kfcv.saving.files import going_on
@@ -172,7 +173,8 @@ class Checkpoints(BaseCallback):
     Put it first among the callbacks, after a :class:`~sb3_kfcv.common.callbacks.StopOnSignal`.
 
     :param folder: where the checkpoints lie
-    :param save_freq: env steps between checkpoints; −1: only when the training is stopped by a signal
+    :param save_freq: env steps between checkpoints, the end of the training being one, too; −1: only when the training is
+        stopped by ``stop``
     :param keep: how many of the latest checkpoints are kept; −1: all
     :param resume: go on from the latest checkpoint in the folder, if there is one
     :param stop: stops the training when a signal comes; a checkpoint is saved before
@@ -191,6 +193,8 @@ class Checkpoints(BaseCallback):
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
+        if save_freq != -1:
+            require_count("save_freq", save_freq)
         if keep == 0:
             raise ValueError("keep=0 would keep no checkpoint; give -1 to keep all")
         self.folder = Path(folder)
@@ -378,7 +382,8 @@ class Checkpoints(BaseCallback):
         if saved["algorithm"] != algorithm:
             raise ResumeError(f"{checkpoint.path} is of {saved['algorithm']}; this model is a {algorithm}")
         if saved["layout"] != model.layout:
-            raise ResumeError(f"{checkpoint.path} is of another world: {saved['layout']}; this model's has {model.layout}")
+            ours, theirs = (f"{layout} and a state of {layout.state_size}" for layout in (model.layout, saved["layout"]))
+            raise ResumeError(f"{checkpoint.path} is of another world: {theirs}; this model's has {ours}")
         names = [name for name in inspect.signature(type(model)).parameters if name not in FREE_SETTINGS]
         for name in ("n_envs", *names):
             if name in saved and _comparable(saved[name]) != _comparable(getattr(model, name)):

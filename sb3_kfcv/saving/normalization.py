@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_kfcv.common.checks import require_between, require_finite
 from sb3_kfcv.saving.archive import open_archive
+from sb3_kfcv.saving.files import with_suffix
 
 SETTINGS = ("clip_obs", "epsilon")
 
@@ -55,7 +56,8 @@ def load_normalization(model_path: str | Path, env: VecEnv, training: bool) -> V
     :param training: whether the statistics go on changing
     :raises ValueError: if the model knows no such statistics, or those of other observations
     """
-    with open_archive(model_path, "model", "checkpoint") as archive:
+    path = Path(model_path)
+    with open_archive(path if path.is_file() else with_suffix(path, ".zip"), "model", "checkpoint") as archive:
         if "normalization" not in archive:
             raise ValueError(f"{model_path} was not trained with normalised observations")
         state = archive.read("normalization")

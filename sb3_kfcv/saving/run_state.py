@@ -26,6 +26,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper, VecMonitor, VecNormalize
 
 from sb3_kfcv.common.checks import require_count
+from sb3_kfcv.envs.particle_worlds import ParticleWorlds
 from sb3_kfcv.saving.normalization import normalization_state, set_normalization_state
 from sb3_kfcv.saving.values import UnwritableError, check_writable
 from sb3_kfcv.vec_env.joint_env import JointEnv
@@ -84,7 +85,8 @@ def env_state(env: VecEnv) -> list[dict[str, Any]]:
         worlds = [_gym_state(world) for world in env.envs]
     else:
         raise UnreadableEnvError(type(env).__name__)
-    return [*layers, {"layer": type(env).__name__, "worlds": worlds, "seeds": list(env._seeds)}]
+    settings = _settings(env.worlds) if isinstance(env, ParticleVecEnv) else {}
+    return [*layers, {"layer": type(env).__name__, "worlds": worlds, "seeds": list(env._seeds), "settings": settings}]
 
 
 def set_env_state(env: VecEnv, layers: list[dict[str, Any]]) -> None:
@@ -103,12 +105,26 @@ def set_env_state(env: VecEnv, layers: list[dict[str, Any]]) -> None:
             continue
         if len(layer["worlds"]) != env.num_envs:
             raise ValueError(f"the state is of {len(layer['worlds'])} worlds; here are {env.num_envs}")
+        if isinstance(env, ParticleVecEnv):
+            _check_settings(env.worlds, layer["settings"])
         env._seeds = list(layer["seeds"])  # which the next reset will take
         for i, world in enumerate(layer["worlds"]):
             if isinstance(env, DummyVecEnv):
                 _set_gym_state(env.envs[i], world)
             else:
                 env.env_method("set_state", world, indices=[i])
+
+
+def _settings(worlds: ParticleWorlds) -> dict[str, Any]:
+    """The arguments that worlds were made with, as far as they keep them."""
+    names = [name for name in inspect.signature(type(worlds)).parameters if hasattr(worlds, name)]
+    return {name: getattr(worlds, name) for name in names}
+
+
+def _check_settings(worlds: ParticleWorlds, saved: dict[str, Any]) -> None:
+    for name, value in _settings(worlds).items():
+        if name in saved and saved[name] != value:
+            raise ValueError(f"the worlds were made with {name}={saved[name]}; these have {name}={value}")
 
 
 def _wrapper_state(env: VecEnvWrapper) -> dict[str, Any]:

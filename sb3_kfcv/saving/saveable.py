@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import pathlib
+import warnings
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar, NoReturn, Protocol, TypeVar
@@ -14,7 +15,7 @@ from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.noise import VectorizedActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.utils import get_system_info
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.stacked_networks import at_most
@@ -167,6 +168,8 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
             with refusals(archive, "parameters"):
                 parameters = archive.read("parameters")
                 n_weights = sum(tensor.numel() for tensor in parameters["policy"].values())
+            if env is not None and "normalization" in archive and unwrap_vec_normalize(env) is None:
+                warnings.warn(f"{archive.name} was trained with normalised observations; wrap its env by load_normalization()")
             if env is not None:
                 _check_env(env, attributes, archive)
                 attributes["n_envs"] = env.num_envs
@@ -269,7 +272,8 @@ def _check_env(env: VecEnv, attributes: dict[str, Any], archive: Archive) -> Non
     """
     found = layout_of(env)
     if found != attributes["layout"]:
-        raise ValueError(f"the model in {archive.name} is for another world: {attributes['layout']}; the env has {found}")
+        theirs, ours = (f"{layout} and a state of {layout.state_size}" for layout in (attributes["layout"], found))
+        raise ValueError(f"the model in {archive.name} is for another world: {theirs}; the env has {ours}")
     for name in ("observation_space", "action_space"):
         if getattr(env, name) != attributes[name]:
             raise ValueError(

@@ -67,6 +67,8 @@ def register(name: str, thing: Any) -> Any:
     :return: the thing, so that ``register`` can be used in an expression
     :raises ValueError: if another thing has the name
     """
+    if not isinstance(name, str) or not name or not callable(thing):
+        raise ValueError(f"register takes a name and a class or function, got {name!r} and {thing!r}")
     if NAMES.setdefault(name, thing) is not thing:
         raise ValueError(f'the name "{name}" is taken by {NAMES[name]}')
     return thing
@@ -138,7 +140,8 @@ def encode(value: Any, place: str, store: Callable[[str, np.ndarray], str]) -> A
             return {TAG: name, **{key: inner(item, key) for key, item in kind.fields(value).items()}}
     what = getattr(value, "__qualname__", None) or f"an object of {type(value).__qualname__}"
     can_be_named = isinstance(value, type) or callable(value)
-    hint = f'; give it a name with sb3_kfcv.register("{getattr(value, "__name__", "...")}", ...)' if can_be_named else ""
+    name = getattr(value, "__name__", "").strip("<>") or "my_own"
+    hint = f'; give it a name of your own: sb3_kfcv.register("{name}", ...)' if can_be_named else ""
     raise UnwritableError(f"{_inside(place)} cannot be saved: it is {what}{hint}")
 
 
