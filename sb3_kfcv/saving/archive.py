@@ -244,7 +244,7 @@ class Archive:
             names = []
         if "_stable_baselines3_version" in names:
             return (
-                "is a file of Stable-Baselines3's own save(); it may hold code (pickles), which is not run here. "
+                "is a file of Stable-Baselines3's own save(); it may hold code, which is not run here. "
                 "Load it with stable_baselines3 where you trust it, and carry its weights over with set_parameters"
             )
         self._file.seek(0)
