@@ -216,7 +216,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     print(EXPLANATION.format(label=ALGO_LABELS[ALGO], algo=ALGO, minutes=args.minutes, episodes=EPISODES_PER_MEASUREMENT))
     command = ["--algo", ALGO, "--env", WORLD, "--preset", "tuned", "--seed", str(args.seed), "-f", str(folder)]
-    training = build(make_parser().parse_all([*command, "--eval-freq", "-1", "--verbose", "0"]))
+    training = build(make_parser().parse_all([*command, "--eval-freq", "-1", "--save-freq", "-1", "--verbose", "0"]))
     run = RunFolder.create(folder, ALGO, WORLD)
     run.describe(training.hyperparams.to_dict(), vars(args), " ".join(["python zoo/demo.py", *(argv or sys.argv[1:])]))
     start_logs(training, run)
