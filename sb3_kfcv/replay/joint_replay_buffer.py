@@ -192,9 +192,9 @@ class JointReplayBuffer(ReplayBuffer):
         index = th.from_numpy(rows)
         n_rows = self.buffer_size * self.n_envs
         for name in TRANSITION_ARRAYS:
-            stored = th.from_numpy(getattr(self, name)).view(n_rows, -1) if into[name].shape[1] else None
-            if stored is None:
+            if not into[name].shape[1]:  # no states are stored
                 continue
+            stored = th.from_numpy(getattr(self, name)).view(n_rows, -1)
             if stored.dtype == th.float32:
                 th.index_select(stored, 0, index, out=into[name])
             else:  # the choices of discrete agents
