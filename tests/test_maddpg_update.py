@@ -374,8 +374,8 @@ def test_target_actions_are_smoothed_within_the_clip():
     (batch,) = draw(model, 1)
     batch = batch._replace(alive=th.ones(BATCH, 3), dones=th.zeros(BATCH, 3))
     plain = model.policy.joint_actions(model.actor_target, batch.next_observations)
-    seen = []
-    model.critic_target.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0][:, -5:]))
+    seen, evaluate = [], model.critic_target.evaluate
+    model.critic_target.evaluate = lambda inputs: seen.append(inputs[:, -5:]) or evaluate(inputs)
     model.td_target(batch)
     assert 0.2 < (seen[0] - plain).abs().max() <= 0.25 + 1e-6
     assert seen[0].abs().max() <= 1

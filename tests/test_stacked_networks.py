@@ -30,24 +30,94 @@ def separate(stack):
 
 
 def spread_inputs(stack, x):
-    """What each network reads, from the stack's inputs."""
-    return x.repeat_interleave(stack.n_networks // len(x), dim=0)
+    """What each member reads, from the stack's inputs."""
+    return x.expand(stack.n_members, -1, -1)
 
 
-# own inputs (None), one for all (1), one per run of two networks (3)
-N_INPUTS = [None, 1, 3]
+INPUTS = pytest.mark.parametrize("common_input", [False, True], ids=["own inputs", "a common input"])
 
 
-def stack_and_input(n_inputs, batch=4):
-    stack = StackedMLP(6, SIZES, n_inputs=n_inputs)
-    return stack, th.randn(6 if n_inputs is None else n_inputs, batch, SIZES[0])
+def stack_and_input(common_input, batch=4, **kwargs):
+    stack = StackedMLP(6, SIZES, common_input=common_input, **kwargs)
+    return stack, th.randn(1 if common_input else stack.n_members, batch, SIZES[0])
 
 
-@pytest.mark.parametrize("n_inputs", N_INPUTS)
-def test_outputs_are_those_of_separate_networks(n_inputs):
-    stack, x = stack_and_input(n_inputs)
+@INPUTS
+def test_outputs_are_those_of_separate_networks(common_input):
+    stack, x = stack_and_input(common_input)
     expected = th.stack([net(own) for net, own in zip(separate(stack), spread_inputs(stack, x), strict=True)])
     close(stack(x), expected)
+    close(stack.evaluate(x), expected)
+
+
+class Leaky(nn.Module):
+    """An activation with a parameter of its own."""
+
+    def __init__(self):
+        super().__init__()
+        self.slope = nn.Parameter(th.tensor(0.3))
+
+    def forward(self, x):
+        return th.where(x > 0, x, self.slope * x)
+
+
+KINDS = {
+    "plain": {},
+    "tanh": {"activation_fn": nn.Tanh},
+    "gelu": {"activation_fn": nn.GELU},
+    "parameters in the activation": {"activation_fn": Leaky},
+    "shared": {"members": [0, 3, 1, 0, 2, 4, 5, 0]},
+    "shared, tanh": {"members": [0, 0, 1, 2, 3, 4, 5, 0], "activation_fn": nn.Tanh},
+}
+
+
+@pytest.mark.parametrize("hidden", [[7, 6], [7], []], ids=["two hidden layers", "one", "none"])
+@pytest.mark.parametrize("kind", KINDS)
+@INPUTS
+def test_evaluation_and_backward_are_those_of_autograd(common_input, kind, hidden):
+    """Twice, with other inputs: nothing of the first evaluation is left in the tensors that the second uses again."""
+    stack = StackedMLP(6, [5, *hidden, 2], common_input=common_input, **KINDS[kind]).double()
+    for _ in range(2):
+        x = th.randn(1 if common_input else stack.n_members, 4, 5, dtype=th.double)
+        gradient = th.randn(stack.n_members, 4, 2, dtype=th.double)
+        values = stack(x)
+        expected = th.autograd.grad(values, list(stack.parameters()), gradient, allow_unused=True)
+        close(stack.evaluate(x), values)
+        stack.backward(gradient)
+        for (name, parameter), theirs in zip(stack.named_parameters(), expected, strict=True):
+            if theirs is not None:  # an activation that nothing passes through
+                th.testing.assert_close(parameter.grad, theirs, atol=1e-12, rtol=1e-12, msg=name)
+
+
+def test_evaluations_of_several_sizes_stand_side_by_side():
+    """Those of one size use the same tensors again; another size has its own, up to a bound."""
+    stack, x = stack_and_input(False, batch=6)
+    first = stack.evaluate(x[:, :4])
+    kept = first.clone()
+    stack.evaluate(x[:, :3])
+    assert th.equal(first, kept)
+    assert stack.evaluate(x[:, 2:]).data_ptr() == first.data_ptr()
+    for size in range(1, 7):
+        close(stack.evaluate(x[:, :size]), stack(x[:, :size]))
+    assert len(stack._evaluations) <= 3
+
+
+def test_evaluations_follow_a_change_of_type():
+    stack, x = stack_and_input(True)
+    stack.evaluate(x)
+    stack.double()
+    assert stack.evaluate(x.double()).dtype == th.double
+
+
+def test_a_borrower_evaluates_in_the_tensors_of_its_lender():
+    one, x = stack_and_input(False)
+    other = StackedMLP(6, SIZES)
+    other.borrow(one)
+    values = one.evaluate(x)
+    expected = other(x)
+    close(other.evaluate(x), expected)
+    close(values, expected)
+    close(one.evaluate(x), one(x))
 
 
 def test_network_is_made_of_linear_layers_and_activations():
@@ -63,9 +133,9 @@ def test_network_is_a_copy():
     close(stack(x), before)
 
 
-@pytest.mark.parametrize("n_inputs", N_INPUTS)
-def test_adam_steps_are_those_of_separate_networks(n_inputs):
-    stack, x = stack_and_input(n_inputs)
+@INPUTS
+def test_adam_steps_are_those_of_separate_networks(common_input):
+    stack, x = stack_and_input(common_input)
     plain = separate(stack)
     stacked_adam = th.optim.Adam(stack.parameters(), lr=1e-2)
     plain_adams = [th.optim.Adam(net.parameters(), lr=1e-2) for net in plain]
@@ -96,10 +166,10 @@ def as_separate_gradients(stack):
     ]
 
 
-@pytest.mark.parametrize("n_inputs", N_INPUTS)
-def test_gradients_are_clipped_network_by_network(n_inputs):
+@INPUTS
+def test_gradients_are_clipped_network_by_network(common_input):
     """Losses of very different sizes, so that some networks are clipped and some are not."""
-    stack, x = stack_and_input(n_inputs)
+    stack, x = stack_and_input(common_input)
     plain = separate(stack)
     scales = th.tensor([1e-3, 1.0, 10.0, 1e-2, 100.0, 0.3])
     (stack(x).square().mean((1, 2)) * scales).sum().backward()
@@ -117,7 +187,7 @@ def test_gradients_are_clipped_network_by_network(n_inputs):
 
 def test_new_networks_are_drawn_as_nn_linear_draws():
     """nn.Linear draws weights and biases evenly from ±1/√inputs: standard deviation 1/√(3·inputs)."""
-    stack = StackedMLP(40, [16, 50, 1], n_inputs=1)
+    stack = StackedMLP(40, [16, 50, 1], common_input=True)
     assert stack.network(39)[0].weight.abs().max() <= 0.25
     for layer, inputs in ((0, 16), (2, 50)):
         drawn = th.cat([net[layer].weight.flatten() for net in separate(stack)])
@@ -129,22 +199,22 @@ def test_new_networks_are_drawn_as_nn_linear_draws():
 MEMBERS = [0, 0, 1, 0, 1]
 
 
-@pytest.mark.parametrize("n_inputs", [None, 1])
-def test_sharing_is_a_one_hot_number_in_the_input(n_inputs):
-    stack = StackedMLP(2, SIZES, n_inputs=n_inputs, members=MEMBERS)
-    x = th.randn(5 if n_inputs is None else 1, 4, SIZES[0])
+@INPUTS
+def test_sharing_is_a_one_hot_number_in_the_input(common_input):
+    stack = StackedMLP(2, SIZES, common_input=common_input, members=MEMBERS)
+    x = th.randn(1 if common_input else 5, 4, SIZES[0])
     nets = one_hot_networks(stack)
     outputs = stack(x)
     for member, net in enumerate(MEMBERS):
-        own = x[member if n_inputs is None else 0]
+        own = x[0 if common_input else member]
         close(outputs[member], nets[net](with_one_hot(own, member, 5)))
         close(outputs[member], stack.network(member)(own))
 
 
-@pytest.mark.parametrize("n_inputs", [None, 1])
-def test_shared_networks_learn_as_networks_with_a_one_hot_number(n_inputs):
-    stack = StackedMLP(2, SIZES, n_inputs=n_inputs, members=MEMBERS)
-    x = th.randn(5 if n_inputs is None else 1, 4, SIZES[0])
+@INPUTS
+def test_shared_networks_learn_as_networks_with_a_one_hot_number(common_input):
+    stack = StackedMLP(2, SIZES, common_input=common_input, members=MEMBERS)
+    x = th.randn(1 if common_input else 5, 4, SIZES[0])
     inputs = x.expand(5, -1, -1)
     nets = one_hot_networks(stack)
     target = th.randn(5, 4, SIZES[-1])
@@ -212,7 +282,7 @@ def test_critics_of_own_observations_equal_separate_networks(share):
         moved = actions.clone()
         moved[:, layout.action_slices[agent]] = own[agent // 2][agent % 2]
         theirs = critics.network(agent)(th.cat([seen, moved[:, order]], dim=1)).squeeze(1)
-        close(critics.with_own_actions(inputs, own)[agent], theirs)
+        close(critics.evaluate_own_actions(inputs, own)[agent], theirs)
 
 
 def test_actors_equal_separate_sb3_actors(layout):
@@ -267,19 +337,21 @@ def test_own_action_replaced_equals_a_plain_evaluation_and_its_gradient(layout, 
     n_obs = sum(layout.obs_sizes)
     inputs = th.randn(5, n_obs + sum(layout.action_sizes))
     new = {i: th.randn(5, layout.action_sizes[i], requires_grad=True) for i in range(layout.n_agents)}
-    plain_new = {i: value.detach().clone().requires_grad_() for i, value in new.items()}
 
-    q_values = critics.with_own_actions(inputs, in_blocks(critics, new))
+    q_values = critics.evaluate_own_actions(inputs, [own.detach() for own in in_blocks(critics, new)])
     weights = th.randn_like(q_values)
-    (q_values * weights).sum().backward()
-
+    gradients = {
+        agent: gradient
+        for block, found in zip(critics.blocks, critics.own_action_gradients(weights), strict=True)
+        for agent, gradient in zip(block.agents, found, strict=True)
+    }
     for i in range(layout.n_agents):
         columns = layout.action_slices[i]
         before, after = inputs[:, : n_obs + columns.start], inputs[:, n_obs + columns.stop :]
-        plain = critics.network(i)(th.cat([before, plain_new[i], after], dim=1)).squeeze(1)
+        plain = critics.network(i)(th.cat([before, new[i], after], dim=1)).squeeze(1)
         close(q_values[i], plain, atol=1e-5)
         (plain * weights[i]).sum().backward()
-        close(new[i].grad, plain_new[i].grad, atol=1e-5)
+        close(gradients[i], new[i].grad, atol=1e-5)
 
 
 def test_own_action_replaced_for_some_of_the_agents():
@@ -289,7 +361,7 @@ def test_own_action_replaced_for_some_of_the_agents():
     n_obs = sum(layout.obs_sizes)
     inputs = th.randn(5, n_obs + sum(layout.action_sizes))
     new = {i: th.randn(5, layout.action_sizes[i]) for i in (1, 3)}
-    q_values = critics.with_own_actions(inputs, in_blocks(critics, new))
+    q_values = critics.evaluate_own_actions(inputs, in_blocks(critics, new))
     for position, i in enumerate((1, 3)):
         moved = inputs.clone()
         moved[:, n_obs:][:, layout.action_slices[i]] = new[i]
@@ -299,8 +371,8 @@ def test_own_action_replaced_for_some_of_the_agents():
 def test_the_actors_step_gives_the_critics_no_gradient(layout):
     critics = critics_of(layout)
     inputs = th.randn(5, sum(layout.obs_sizes) + sum(layout.action_sizes))
-    new = {i: th.randn(5, layout.action_sizes[i], requires_grad=True) for i in range(layout.n_agents)}
-    critics.with_own_actions(inputs, in_blocks(critics, new)).sum().backward()
+    new = {i: th.randn(5, layout.action_sizes[i]) for i in range(layout.n_agents)}
+    critics.own_action_gradients(th.ones_like(critics.evaluate_own_actions(inputs, in_blocks(critics, new))))
     assert all(parameter.grad is None for parameter in critics.parameters())
 
 

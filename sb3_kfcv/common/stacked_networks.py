@@ -20,6 +20,9 @@ from torch import nn
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.memory import require_memory
 
+# Minibatch sizes whose tensors a stack keeps: those of a learner, of the worlds that it acts in, and of a refresh's chunks.
+SIZES_KEPT = 3
+
 _weights_left: ContextVar[float] = ContextVar("weights_left", default=math.inf)
 
 
@@ -52,106 +55,54 @@ class StackedLinear(nn.Module):
         self.weight = nn.Parameter(th.empty(n, in_features, out_features).uniform_(-bound, bound))
         self.bias = nn.Parameter(th.empty(n, 1, out_features).uniform_(-bound, bound))
 
-    def forward(self, x: th.Tensor, members: th.Tensor | None = None, frozen: bool = False) -> th.Tensor:
+    def forward(self, x: th.Tensor, members: th.Tensor | None = None) -> th.Tensor:
         """
         :param x: (n, batch, in)
         :param members: which layer serves each row of ``x``'s first axis; by default layer i serves row i
-        :param frozen: give no gradient to the parameters (and spend no time on it)
         """
-        weight, bias = (self.weight.detach(), self.bias.detach()) if frozen else (self.weight, self.bias)
-        if members is not None:
-            weight, bias = weight[members], bias[members]
-        return th.baddbmm(bias, x, weight)
-
-
-class _Chain(th.autograd.Function):
-    """
-    The layers of a plain ReLU stack as one step of the graph: what autograd would do, in fewer and larger strides.
-
-    Gradients of the parameters are written into the tensors of the last update instead of new ones, which for large networks
-    costs more than computing them. A second backward pass through the same stack before an optimiser step therefore replaces
-    the first one's gradients; nobody here makes one.
-    """
-
-    @staticmethod
-    def forward(ctx, x, stack, from_first, *parameters):  # type: ignore[no-untyped-def, override]
-        """
-        :param x: input of the stack (inputs, batch, in); or with ``from_first=False`` the first layer's pre-activations
-        :param stack: the networks
-        :param from_first: whether the first layer is part of it
-        :param parameters: those that get a gradient; none for frozen networks
-        """
-        hidden: list[th.Tensor] = []
-        z = stack._spread(stack.first(x)) if from_first else x
-        for layer in stack.rest:
-            hidden.append(z.relu_() if hidden or from_first else z.relu())
-            z = th.baddbmm(layer.bias, hidden[-1], layer.weight)
-        ctx.stack, ctx.x, ctx.hidden, ctx.frozen = stack, x if from_first else None, hidden, not parameters
-        ctx.n_parameters = len(parameters)
-        return z
-
-    @staticmethod
-    def backward(ctx, gradient):  # type: ignore[no-untyped-def, override]
-        stack, x = ctx.stack, ctx.x
-        for layer, hidden in zip(reversed(stack.rest), reversed(ctx.hidden), strict=True):
-            if not ctx.frozen:
-                th.bmm(hidden.transpose(1, 2), gradient, out=_gradient_of(layer.weight))
-                th.sum(gradient, dim=1, keepdim=True, out=_gradient_of(layer.bias))
-            gradient = th.ops.aten.threshold_backward(th.bmm(gradient, layer.weight.transpose(1, 2)), hidden, 0)
-        if x is not None and not ctx.frozen:
-            wide = stack._gather_up(gradient)  # (inputs, batch, networks per input · hidden)
-            th.bmm(x.transpose(1, 2), wide, out=_gradient_of(stack.first.weight))
-            th.sum(wide, dim=1, keepdim=True, out=_gradient_of(stack.first.bias))
-        needs_input = ctx.needs_input_grad[0]
-        if needs_input and x is not None:
-            gradient = th.bmm(stack._gather_up(gradient), stack.first.weight.transpose(1, 2))
-        return (gradient if needs_input else None, None, None, *([None] * ctx.n_parameters))
-
-
-def _gradient_of(parameter: nn.Parameter) -> th.Tensor:
-    """The tensor of a parameter's gradient, to be written anew."""
-    if parameter.grad is None:
-        parameter.grad = th.empty_like(parameter)
-    return parameter.grad
+        if members is None:
+            return th.baddbmm(self.bias, x, self.weight)
+        return th.baddbmm(self.bias[members], x, self.weight[members])
 
 
 class StackedMLP(nn.Module):
     """
     A stack of multi-layer perceptrons of one shape.
 
-    Networks may read the same input: with ``n_inputs=1`` all of them do, and their first layers are one matrix
-    product; with ``n_inputs=K`` consecutive runs of ``n_networks / K`` networks share one of K inputs. By default
-    each network has an input of its own.
+    Each network has an input of its own, or all read the same (``common_input``); then their first layers are one matrix
+    product.
 
     Members may share a network: ``members[i]`` is the network that member i uses. Then every member has a
     first-layer bias of its own, which is what appending its one-hot index to the input amounts to; and it may read a
     common input in an order of its own: ``input_order[i][c]`` is the input of its network that takes column c.
 
+    :meth:`forward` is plain PyTorch; :meth:`evaluate` and :meth:`backward` give the same values and gradients faster, see
+    :class:`Evaluation`.
+
     :param n_networks: number of networks
     :param sizes: width of the input, of each hidden layer, and of the output
     :param activation_fn: activation between layers
-    :param n_inputs: number of distinct inputs; a divisor of ``n_networks``
+    :param common_input: whether all read the same input
     :param members: network of each member; by default member i uses network i
-    :param input_order: (members, in) order in which each member reads a common input; only with ``members`` and
-        ``n_inputs=1``
+    :param input_order: (members, in) order in which each member reads a common input; only with ``members``
     """
 
     members: th.Tensor | None
-    input_order: th.Tensor | None
+    wide_rows: th.Tensor | None
 
     def __init__(
         self,
         n_networks: int,
         sizes: Sequence[int],
         activation_fn: type[nn.Module] = nn.ReLU,
-        n_inputs: int | None = None,
+        common_input: bool = False,
         members: Sequence[int] | None = None,
         input_order: th.Tensor | None = None,
     ) -> None:
         super().__init__()
         self.n_networks = n_networks
-        self.input_per_member = n_inputs is None
-        self.n_inputs = n_networks if n_inputs is None else n_inputs
+        self.n_members = n_networks if members is None else len(members)
+        self.common_input = common_input
         self.sizes = list(sizes)
         for size in sizes:
             require_count("the width of a layer", size)
@@ -161,90 +112,118 @@ class StackedMLP(nn.Module):
             raise MemoryError(f"a stack of {n_networks} networks {self.sizes} is more than the file holds")
         require_memory(f"a stack of {n_networks} networks {self.sizes}", 16 * n_weights)  # float32; gradient, two moments
         self.activation = activation_fn()
-        self.is_plain = members is None and activation_fn is nn.ReLU
-        self.first = StackedLinear(self.n_inputs, sizes[0], n_networks // self.n_inputs * sizes[1])
+        self.first = StackedLinear(1 if common_input else n_networks, sizes[0], sizes[1] * (n_networks if common_input else 1))
         self.rest = nn.ModuleList(StackedLinear(n_networks, n_in, n_out) for n_in, n_out in pairwise(sizes[1:]))
         self.member_bias: nn.Parameter | None = None
+        self._evaluations: dict[int, Evaluation] = {}  # by batch size
+        self._lender: tuple[StackedMLP, ...] = ()
         self.register_buffer("members", None if members is None else th.tensor(list(members)), persistent=False)
-        self.register_buffer("input_order", input_order, persistent=False)
+        wide_rows = None
         if members is not None:
             bound = 1 / math.sqrt(sizes[0] + len(members))
             self.member_bias = nn.Parameter(th.empty(len(members), 1, sizes[1]).uniform_(-bound, bound))
+            if common_input:
+                order = th.arange(sizes[0]).repeat(len(members), 1) if input_order is None else input_order
+                wide_rows = self._rows(self.members, order).T.flatten()  # type: ignore[arg-type]
+        self.register_buffer("wide_rows", wide_rows, persistent=False)
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         """
-        :param x: (inputs, batch, in); with own inputs per network: (members, batch, in)
+        :param x: (members, batch, in); the common input (1, batch, in)
         :return: (members, batch, out)
         """
-        if self.is_plain and th.is_grad_enabled():
-            return _Chain.apply(x, self, True, *self.parameters())
-        return self.after_first_layer(self.first_layer(x))
-
-    def _spread(self, z: th.Tensor) -> th.Tensor:
-        """(inputs, batch, networks per input · hidden) → (networks, batch, hidden), a view."""
-        if self.n_inputs == self.n_networks:
-            return z
-        return z.unflatten(-1, (-1, self.sizes[1])).transpose(1, 2).flatten(0, 1)
-
-    def _gather_up(self, z: th.Tensor) -> th.Tensor:
-        """Inverse of :meth:`_spread`."""
-        if self.n_inputs == self.n_networks:
-            return z
-        return z.unflatten(0, (self.n_inputs, -1)).transpose(1, 2).flatten(2)
-
-    def first_layer(self, x: th.Tensor) -> th.Tensor:
-        """
-        Pre-activations of the first layer.
-
-        :param x: as for :meth:`forward`
-        :return: (members, batch, hidden)
-        """
-        width = self.sizes[1]
-        if self.input_per_member:
-            z = self.first(x, self.members)
-        elif self.input_order is not None:
-            weight = self._columns(self.first.weight, slice(None), self.input_order)  # (members, in, hidden)
-            weight = weight.transpose(0, 1).flatten(1)  # (in, members · hidden): still one product
-            z = (x[0] @ weight).unflatten(-1, (-1, width)).transpose(0, 1)
-            z = z + self.first.bias.unflatten(-1, (-1, width))[0, 0, self.members].unsqueeze(1)
+        if self.common_input:
+            weight, bias = self.side_by_side(self.first.weight, self.first.bias)
+            z = self.spread(th.addmm(bias, x[0], weight))
         else:
-            z = self.first(x).unflatten(-1, (-1, width)).transpose(1, 2).flatten(0, 1)  # (networks, batch, hidden)
-            z = z if self.members is None else z[self.members]
-        return z if self.member_bias is None else z + self.member_bias
-
-    def after_first_layer(self, z: th.Tensor, frozen: bool = False) -> th.Tensor:
-        """
-        The rest of the networks.
-
-        :param z: (members, batch, hidden), pre-activations of the first layer
-        :param frozen: give no gradient to the parameters
-        :return: (members, batch, out)
-        """
-        if self.is_plain and frozen and z.requires_grad:
-            return _Chain.apply(z, self, False)
+            z = self.first(x, self.members)
+        if self.member_bias is not None:
+            z = z + self.member_bias
         for layer in self.rest:
-            z = layer(self.activation(z), self.members, frozen)
+            z = layer(self.activation(z), self.members)
         return z
 
-    def input_columns(self, members: th.Tensor, columns: th.Tensor) -> th.Tensor:
-        """
-        First-layer weights of some inputs of some members.
+    def side_by_side(self, weight: th.Tensor, bias: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """First layer of all members on a common input: weight (in, members · hidden), bias (1, members · hidden)."""
+        if self.wide_rows is None:
+            return weight[0], bias[0]
+        width = self.sizes[1]
+        wide = weight.view(-1, width).index_select(0, self.wide_rows)
+        return wide.view(self.sizes[0], -1), bias.view(-1, width)[self.members].view(1, -1)
 
-        :param members: (m,) numbers of the members
-        :param columns: (m, k) positions in the input
-        :return: (m, k, hidden), without gradient
-        """
-        if self.input_order is not None:
-            columns = self.input_order[members].gather(1, columns.to(self.input_order.device))
-        return self._columns(self.first.weight.detach(), members, columns)
+    def spread(self, z: th.Tensor) -> th.Tensor:
+        """(batch, members · hidden) → (members, batch, hidden), a view."""
+        return z.view(len(z), -1, self.sizes[1]).transpose(0, 1)
 
-    def _columns(self, weight: th.Tensor, members: th.Tensor | slice, columns: th.Tensor) -> th.Tensor:
-        """Rows of the first layer's weight for some members, (members, columns, hidden)."""
-        everyone = th.arange(self.n_networks, device=weight.device) if self.members is None else self.members
-        networks = everyone[members][:, None]
-        if self.input_per_member:
-            return weight[networks, columns]
-        return weight[0].unflatten(-1, (self.n_networks, self.sizes[1]))[columns, networks]
+    def evaluate(self, x: th.Tensor) -> th.Tensor:
+        """
+        As :meth:`forward`, and remembered for :meth:`backward`.
+
+        :param x: as for :meth:`forward`
+        :return: (members, batch, out), overwritten by the next evaluation
+        """
+        evaluation = self.evaluation(x.shape[1])
+        evaluation.first_layer(x)
+        return evaluation.rest()
+
+    def backward(self, gradient: th.Tensor) -> None:
+        """
+        Write the gradients of the parameters into their ``grad``, from the latest :meth:`evaluate` of this batch size, once.
+
+        :param gradient: of the loss, at its values (members, batch, out)
+        """
+        self._evaluations[gradient.shape[1]].backward(gradient)
+
+    def evaluation(self, batch: int) -> Evaluation:
+        """
+        The place of evaluations of this size; its tensors are those of the latest one.
+
+        :param batch: rows
+        """
+        found = self._evaluations.get(batch)
+        if found is None or not found.fits(self):
+            if len(self._evaluations) >= SIZES_KEPT:
+                self._evaluations.clear()
+            lent = [stack.evaluation(batch) for stack in self._lender]
+            found = self._evaluations[batch] = Evaluation(self, batch, *lent)
+        return found
+
+    def borrow(self, lender: StackedMLP) -> None:
+        """
+        Evaluate in the tensors of another stack of the same shape, as a target network can: what is in use stays in the
+        processor's cache.
+
+        :param lender: the other stack; each one's evaluation overwrites the other's
+        """
+        self._lender = (lender,)
+
+    def first_layer_rows(self, members: Sequence[int], columns: th.Tensor) -> th.Tensor:
+        """
+        Where some inputs' weights stand in the first layer, for :meth:`first_layer_weights`.
+
+        :param members: numbers of the members
+        :param columns: (len(members), k) positions in the input
+        :return: (len(members), k)
+        """
+        if self.wide_rows is not None:
+            wide = self.wide_rows.view(self.sizes[0], self.n_members)
+            return wide[columns, th.tensor(list(members))[:, None]]
+        return self._rows(th.tensor(list(members)) if self.members is None else self.members[list(members)], columns)
+
+    def _rows(self, networks: th.Tensor, columns: th.Tensor) -> th.Tensor:
+        """The same by network (m,) instead of member."""
+        if self.common_input:
+            return columns * self.n_networks + networks[:, None]
+        return networks[:, None] * self.sizes[0] + columns
+
+    @th.no_grad()
+    def first_layer_weights(self, rows: th.Tensor) -> th.Tensor:
+        """
+        :param rows: (m, k), see :meth:`first_layer_rows`
+        :return: (m, k, hidden)
+        """
+        width = self.sizes[1]
+        return self.first.weight.view(-1, width).index_select(0, rows.flatten()).view(*rows.shape, width)
 
     def gradient_norms(self) -> th.Tensor:
         """Euclidean norm of each network's gradient: (networks,)."""
@@ -270,7 +249,7 @@ class StackedMLP(nn.Module):
         """A parameter, or its gradient, viewed as (inputs, rows, networks per input, columns)."""
         assert tensor is not None, "no gradient yet"
         if layer is self.first:
-            return tensor.unflatten(-1, (self.n_networks // self.n_inputs, self.sizes[1]))
+            return tensor.unflatten(-1, (-1, self.sizes[1]))
         return tensor.unsqueeze(2)
 
     @th.no_grad()
@@ -281,14 +260,11 @@ class StackedMLP(nn.Module):
         :param index: number of the member
         """
         net = index if self.members is None else int(self.members[index])
-        per_input = self.n_networks // self.n_inputs
-        columns = slice(net % per_input * self.sizes[1], (net % per_input + 1) * self.sizes[1])
-        first_weight = self.first.weight[net // per_input][:, columns]
-        if self.input_order is not None:
-            first_weight = first_weight[self.input_order[index]]
-        weights = [(first_weight, self.first.bias[net // per_input, 0, columns].clone())]
+        everything = self.first_layer_rows([index], th.arange(self.sizes[0])[None])
+        first_bias = self.first.bias.view(-1, self.sizes[1])[net]
         if self.member_bias is not None:
-            weights[0][1].add_(self.member_bias[index, 0])
+            first_bias = first_bias + self.member_bias[index, 0]
+        weights = [(self.first_layer_weights(everything)[0], first_bias)]
         weights += [(layer.weight[net], layer.bias[net, 0]) for layer in self.rest]  # type: ignore[index]
         layers: list[nn.Module] = []
         for weight, bias in weights:
@@ -297,3 +273,160 @@ class StackedMLP(nn.Module):
             linear.bias.copy_(bias)
             layers += [linear, type(self.activation)()]
         return nn.Sequential(*layers[:-1])
+
+
+class Evaluation:
+    """
+    The values of a stack at minibatches of one size, and their gradients by the chain rule written out: without autograd's
+    graph, whose making costs more than small networks do, and in tensors that the next evaluation uses again, since new
+    memory costs more than the arithmetic on it.
+
+    :param stack: the networks
+    :param batch: rows
+    :param lender: an evaluation of the same shape, whose tensors to use
+    """
+
+    def __init__(self, stack: StackedMLP, batch: int, lender: Evaluation | None = None) -> None:
+        self.stack, self.batch = stack, batch
+        self.relu = isinstance(stack.activation, nn.ReLU)
+        self.members, self.wide_rows, self.width = stack.members, stack.wide_rows, stack.sizes[1]
+        self.parameters: list[tuple[nn.Parameter, nn.Parameter]] = [(layer.weight, layer.bias) for layer in stack.rest]  # type: ignore[misc]
+        self.weights = [(weight.detach(), bias.detach()) for weight, bias in self.parameters]
+        self.first, self.first_bias = stack.first.weight.detach(), stack.first.bias.detach()
+        self.member_bias = None if stack.member_bias is None else stack.member_bias.detach()
+        self.x = self.first  # the input, once there is one
+        self.graphs: list[tuple[th.Tensor, th.Tensor]] = []  # of activations other than ReLU: what went in and what came out
+        sizes = stack.sizes[1:]
+        if lender is None:
+            self.wide, first = self._first_layer()
+            self.layers = [first, *(self.first.new_empty(stack.n_members, batch, size) for size in sizes[1:])]
+            self.wide_gradient, first = self._first_layer()
+            self.gradients = [first, *(self.first.new_empty(stack.n_members, batch, size) for size in sizes[1:-1])]
+        else:
+            self.wide, self.layers = lender.wide, lender.layers
+            self.wide_gradient, self.gradients = lender.wide_gradient, lender.gradients
+
+    def _first_layer(self) -> tuple[th.Tensor, th.Tensor]:
+        """For the first layer, and viewed as (members, batch, hidden); with a common input its members stand side by side."""
+        stack = self.stack
+        if not stack.common_input:
+            z = self.first.new_empty(stack.n_members, self.batch, self.width)
+            return z, z
+        wide = self.first.new_empty(self.batch, stack.n_members * self.width)
+        return wide, stack.spread(wide)
+
+    def fits(self, stack: StackedMLP) -> bool:
+        """Whether it is for the parameters as they are: a module's ``to`` replaces their data."""
+        return stack.first.weight.data_ptr() == self.first.data_ptr()
+
+    def first_layer(self, x: th.Tensor) -> th.Tensor:
+        """
+        :param x: as for :meth:`StackedMLP.forward`
+        :return: (members, batch, hidden), pre-activations of the first layer, which may be changed before :meth:`rest`
+        """
+        self.x = x
+        if self.stack.common_input:
+            weight, bias = self.stack.side_by_side(self.first, self.first_bias)
+            th.addmm(bias, x[0], weight, out=self.wide)
+        else:
+            self._layer(x, self.first, self.first_bias, self.wide)
+        if self.member_bias is not None:
+            self.layers[0].add_(self.member_bias)
+        return self.layers[0]
+
+    def rest(self) -> th.Tensor:
+        """
+        The layers after the first.
+
+        :return: (members, batch, out)
+        """
+        self.graphs.clear()
+        for z, (weight, bias), out in zip(self.layers, self.weights, self.layers[1:], strict=False):
+            self._layer(self._activate(z), weight, bias, out)
+        return self.layers[-1]
+
+    def backward(self, gradient: th.Tensor, parameters: bool = True) -> th.Tensor:
+        """
+        Backpropagation, once after each evaluation.
+
+        :param gradient: of the loss, at the values (members, batch, out)
+        :param parameters: write the gradients of the parameters into their ``grad``
+        :return: the gradient at the pre-activations of the first layer (members, batch, hidden)
+        """
+        if not self.weights:
+            self.gradients[0].copy_(gradient)
+        for i in reversed(range(len(self.weights))):
+            if parameters:
+                self._write_gradients(self._hidden(i), gradient, *self.parameters[i])
+            weight, _ = self.weights[i]
+            weight = weight if self.members is None else weight[self.members]
+            gradient = th.bmm(gradient, weight.transpose(1, 2), out=self.gradients[i])
+            self._through_activation(i, gradient, parameters)
+        if parameters:
+            self._write_first_gradients()
+        return self.gradients[0]
+
+    def _layer(self, x: th.Tensor, weight: th.Tensor, bias: th.Tensor, out: th.Tensor) -> None:
+        if self.members is not None:
+            weight, bias = weight[self.members], bias[self.members]
+        th.baddbmm(bias, x, weight, out=out)
+
+    def _write_gradients(self, x: th.Tensor, gradient: th.Tensor, weight: nn.Parameter, bias: nn.Parameter) -> None:
+        """Of a layer with input ``x``, from the gradient at its output."""
+        if self.members is None:
+            th.bmm(x.transpose(1, 2), gradient, out=gradient_of(weight))
+            th.sum(gradient, dim=1, keepdim=True, out=gradient_of(bias))
+        else:
+            gradient_of(weight).zero_().index_add_(0, self.members, th.bmm(x.transpose(1, 2), gradient))
+            gradient_of(bias).zero_().index_add_(0, self.members, gradient.sum(1, keepdim=True))
+
+    def _write_first_gradients(self) -> None:
+        stack, gradient = self.stack, self.gradients[0]
+        weight, bias = stack.first.weight, stack.first.bias
+        if not stack.common_input:
+            self._write_gradients(self.x, gradient, weight, bias)
+        elif self.wide_rows is None:
+            th.mm(self.x[0].T, self.wide_gradient, out=gradient_of(weight)[0])
+            th.sum(self.wide_gradient, dim=0, keepdim=True, out=gradient_of(bias)[0])
+        else:
+            wide = th.mm(self.x[0].T, self.wide_gradient).view(-1, self.width)
+            gradient_of(weight).zero_().view(-1, self.width).index_add_(0, self.wide_rows, wide)
+            gradient_of(bias).zero_().view(-1, self.width).index_add_(0, stack.members, gradient.sum(1))  # type: ignore[arg-type]
+        if stack.member_bias is not None:
+            th.sum(gradient, dim=1, keepdim=True, out=gradient_of(stack.member_bias))
+
+    def _activate(self, z: th.Tensor) -> th.Tensor:
+        if self.relu:
+            return z.relu_()
+        with th.enable_grad():
+            leaf = z.detach().requires_grad_()
+            hidden = self.stack.activation(leaf)
+        self.graphs.append((leaf, hidden))
+        return hidden.detach()
+
+    def _hidden(self, i: int) -> th.Tensor:
+        """What the i-th activation gave."""
+        return self.layers[i] if self.relu else self.graphs[i][1].detach()
+
+    def _through_activation(self, i: int, gradient: th.Tensor, parameters: bool) -> None:
+        """Turn the gradient behind the i-th activation into the one before it."""
+        if self.relu:
+            _threshold_backward(gradient, self.layers[i], 0, grad_input=gradient)
+            return
+        leaf, hidden = self.graphs[i]
+        own = list(self.stack.activation.parameters()) if parameters else []  # such as nn.PReLU's
+        before, *found = th.autograd.grad(hidden, [leaf, *own], gradient)
+        gradient.copy_(before)
+        for parameter, part in zip(own, found, strict=True):
+            first = i == len(self.weights) - 1  # backpropagation begins at the last activation
+            parameter.grad = part if first or parameter.grad is None else parameter.grad + part
+
+
+_threshold_backward = th.ops.aten.threshold_backward.grad_input
+
+
+def gradient_of(parameter: nn.Parameter) -> th.Tensor:
+    """The tensor of a parameter's gradient, to be written anew."""
+    if parameter.grad is None:
+        parameter.grad = th.empty_like(parameter)
+    return parameter.grad

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import torch as th
 
+from sb3_kfcv.common.adam import LeanAdam
+from sb3_kfcv.common.live import shares
 from sb3_kfcv.common.stacked_networks import StackedMLP
 from sb3_kfcv.saving.parameters import check_network, check_optimizer
 
@@ -39,15 +41,17 @@ class Teachers:
     ) -> None:
         self.n_folds = n_folds
         self.stack = StackedMLP(n_folds, [input_size, *net_arch, n_agents]).to(device)
-        self.optimizer = th.optim.Adam(self.stack.parameters(), lr=learning_rate, fused=True)
+        self.optimizer = LeanAdam(self.stack.parameters(), lr=learning_rate, fused=True)
 
+    @th.no_grad()
     def values(self, inputs: th.Tensor) -> th.Tensor:
         """
         :param inputs: (folds, batch, features), one batch per teacher; or (1, batch, features), the same for all
         :return: Q (folds, agents, batch)
         """
-        return self.stack(inputs.expand(self.n_folds, -1, -1)).transpose(1, 2)
+        return self.stack.evaluate(inputs.expand(self.n_folds, -1, -1)).transpose(1, 2).clone()
 
+    @th.no_grad()
     def fit(
         self,
         inputs: th.Tensor,
@@ -70,17 +74,16 @@ class Teachers:
         :param rng: generator of the draws
         :return: mean squared error over the last tenth of the steps, on the teachers' own folds
         """
+        targets, live = targets.T.contiguous(), live.T.contiguous()  # (n, agents)
         losses = []
         for _ in range(steps):
             drawn = np.stack([rows[rng.integers(len(rows), size=batch_size)] for rows in rows_per_fold])  # (folds, batch)
             picked = th.as_tensor(drawn, device=inputs.device)
-            errors = (targets[:, picked].transpose(0, 1) - self.values(inputs[picked])).square()  # (folds, agents, batch)
-            lived = live[:, picked].transpose(0, 1)
-            per_teacher = (errors * lived).sum(-1) / lived.sum(-1).clamp(min=1)  # (folds, agents)
-            self.optimizer.zero_grad()
-            per_teacher.sum().backward()
+            errors = targets[picked] - self.values(inputs[picked]).transpose(1, 2)  # (folds, batch, agents)
+            weighted = errors * shares(live[picked], dim=1)
+            losses.append((weighted * errors).sum(1).mean())
+            self.stack.backward(weighted.mul_(-2))
             self.optimizer.step()
-            losses.append(per_teacher.detach().mean())
         return th.stack(losses[-max(steps // 10, 1) :]).mean().item()
 
     def state_dict(self) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import torch as th
 from sb3_kfcv.common.layout import AgentLayout
 
 if TYPE_CHECKING:
-    from sb3_kfcv.maddpg.policies import OwnObservationCritics, StackedActors, StackedCritics
+    from sb3_kfcv.maddpg.policies import CentralCritics, StackedActors
 
 # Logged values are means over this many of the latest updates.
 WINDOW = 100
@@ -50,7 +50,7 @@ class Diagnostics:
         self._own_actions = [actions.detach() for actions in own_actions]
         self._norms.pop("actor", None)
 
-    def series(self, actor: StackedActors, critic: StackedCritics | OwnObservationCritics) -> dict[str, float]:
+    def series(self, actor: StackedActors, critic: CentralCritics) -> dict[str, float]:
         """
         Name → value of everything to log; losses and Q-values per group, gradient norms of the latest update.
 
@@ -70,7 +70,7 @@ class Diagnostics:
                 values["train/action_saturation"] = saturated.mean().item()
         return values
 
-    def get_state(self, actor: StackedActors, critic: StackedCritics | OwnObservationCritics) -> dict[str, Any]:
+    def get_state(self, actor: StackedActors, critic: CentralCritics) -> dict[str, Any]:
         """Everything that :meth:`series` will show, as plain values; the networks are those of :meth:`series`."""
         logged = self.series(actor, critic)
         return {
@@ -99,5 +99,5 @@ class Diagnostics:
                 values[f"{key}_{group}"] = stacked[:, positions].mean().item()
 
 
-def _mean_norm(networks: StackedActors | StackedCritics | OwnObservationCritics) -> float:
+def _mean_norm(networks: StackedActors | CentralCritics) -> float:
     return th.cat([stack.gradient_norms() for stack in networks.stacks]).mean().item()  # type: ignore[operator]

@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import nn
 
 from sb3_kfcv.common.checks import require_between, require_count, require_finite_columns, require_parameters
+from sb3_kfcv.common.live import shares
 from sb3_kfcv.common.memory import free_memory, in_words
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.patient_logs import patience
@@ -28,12 +29,10 @@ from sb3_kfcv.common.team_policy import TeamPolicy
 from sb3_kfcv.maddpg.diagnostics import Diagnostics
 from sb3_kfcv.maddpg.policies import (
     CRITIC_INPUTS,
+    CentralCritics,
     MADDPGPolicy,
     MlpPolicy,
-    OwnObservationCritics,
     StackedActors,
-    StackedCritics,
-    by_agent,
 )
 from sb3_kfcv.replay import JointReplayBuffer, JointReplayBufferSamples
 from sb3_kfcv.saving.saveable import SaveableAlgorithm
@@ -103,8 +102,8 @@ class MADDPG(SaveableAlgorithm):
     replay_buffer: JointReplayBuffer
     actor: StackedActors
     actor_target: StackedActors
-    critic: StackedCritics | OwnObservationCritics
-    critic_target: StackedCritics | OwnObservationCritics
+    critic: CentralCritics
+    critic_target: CentralCritics
 
     def __init__(
         self,
@@ -283,6 +282,7 @@ class MADDPG(SaveableAlgorithm):
         # Asked for at every update, and slow to gather.
         self._parameters: dict[nn.Module, list[nn.Parameter]] = {network: list(network.parameters()) for network in networks}
 
+    @th.no_grad()
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
         """
         Update all agents, as the inner loop of Algorithm 1.
@@ -301,21 +301,26 @@ class MADDPG(SaveableAlgorithm):
             # by priority, or by the curriculum, whose folds, teachers, scores and stages it refreshes when due.
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             live = self.live(batch)  # (agents, batch): a dead agent's rows enter no loss
+            share = shares(live)  # (agents, batch): of each row in its agent's loss
 
             # Eq. 5: minimise (y − Q)², y = r + γ Q'(s', a'_1 … a'_N)
             inputs = self._critic_inputs(batch.observations, batch.states, self.policy.encode(batch.actions), batch.alive)
             targets = self.td_target(batch)  # (agents, batch)
-            errors = targets - self.critic(inputs)  # (critics, agents, batch)
-            critic_losses = live_mean(errors.square() * batch.weights, live)  # (critics, agents)
+            errors = targets - self.critic.evaluate(inputs)  # (critics, agents, batch)
+            weighted = errors * (share * batch.weights)
+            critic_losses = (weighted * errors).sum(-1)  # (critics, agents)
             self._check_losses("critic loss", critic_losses.sum(0))
-            self._minimise(self.critic, critic_losses.sum())
+            self.critic.backward(weighted.mul_(-2))
+            self._step(self.critic)
 
             # Eq. 6: ascend Q(s, a_1 … π_i(o_i) … a_N)
             if self._n_updates % self.policy_delay == 0:
-                own_actions, raw = self.actor.relaxed(batch.observations, self.gumbel_temperature)
-                actor_losses = -live_mean(self.critic.with_own_actions(inputs, own_actions), live)  # (agents,)
+                own_actions = self.actor.evaluate(batch.observations, self.gumbel_temperature)
+                actor_losses = -(self.critic.evaluate_own_actions(inputs, own_actions) * share).sum(-1)  # (agents,)
                 self._check_losses("actor loss", actor_losses)
-                self._minimise(self.actor, actor_losses.sum() + self._penalty(raw, live))
+                penalties = self.actor_regularization * share if self.actor_regularization > 0 else None
+                self.actor.backward(self.critic.own_action_gradients(-share), penalties)
+                self._step(self.actor)
                 self._watch.actors(actor_losses, own_actions)
 
                 # θ' ← τθ + (1 − τ)θ'
@@ -323,7 +328,7 @@ class MADDPG(SaveableAlgorithm):
                 self._follow(self.actor_target, self.actor)
 
             if self.replay_buffer.uses_td_errors:
-                self.replay_buffer.update_priorities(batch.rows, live_mean(errors[0].detach().abs().T, live.T))
+                self.replay_buffer.update_priorities(batch.rows, (errors[0].abs() * shares(live, dim=0)).sum(0))
             self._watch.critics(critic_losses, targets)
 
         self._watch.update_seconds += time.perf_counter() - start
@@ -336,12 +341,13 @@ class MADDPG(SaveableAlgorithm):
 
         :return: (agents, batch), the learning agents
         """
-        next_alive = batch.alive * (1 - batch.dones)
+        continues = 1 - batch.dones  # (batch, agents)
         next_actions = self._target_actions(batch.next_observations)
-        next_inputs = self._critic_inputs(batch.next_observations, batch.next_states, next_actions, next_alive)
-        next_q_values = self.critic_target(next_inputs).amin(0)
-        continues = 1 - batch.dones.T[self._learning]
-        return self.reward_scale * batch.rewards.T[self._learning] + self.gamma * continues * next_q_values
+        next_inputs = self._critic_inputs(batch.next_observations, batch.next_states, next_actions, batch.alive * continues)
+        next_q_values = self.critic_target.evaluate(next_inputs).amin(0)
+        rewards = batch.rewards if self.reward_scale == 1 else self.reward_scale * batch.rewards
+        rewards, continues = rewards.T[self._learning], continues.T[self._learning]
+        return th.addcmul(rewards, continues, next_q_values, value=self.gamma)
 
     def teacher_inputs(self, batch: JointReplayBufferSamples) -> th.Tensor:
         """
@@ -351,7 +357,7 @@ class MADDPG(SaveableAlgorithm):
         :return: (batch, features)
         """
         seen = batch.states if self._teachers_see_state else batch.observations
-        return th.cat([seen, self.policy.encode(batch.actions) * batch.alive[:, self._agent_of_column]], dim=1)
+        return th.cat([seen, self.policy.encode(batch.actions) * batch.alive.index_select(1, self._agent_of_column)], dim=1)
 
     @th.no_grad()
     def q_values(self, batch: JointReplayBufferSamples) -> th.Tensor:
@@ -369,7 +375,7 @@ class MADDPG(SaveableAlgorithm):
 
     def _critic_inputs(self, observations: th.Tensor, states: th.Tensor, actions: th.Tensor, alive: th.Tensor) -> th.Tensor:
         seen = states if self.critic_input == "state" else observations
-        return th.cat([seen, actions * alive[:, self._agent_of_column]], dim=1)
+        return th.cat([seen, actions * alive.index_select(1, self._agent_of_column)], dim=1)
 
     def _target_actions(self, observations: th.Tensor) -> th.Tensor:
         """(batch, joint action): a' of all agents, the learning ones by their target actors."""
@@ -383,14 +389,6 @@ class MADDPG(SaveableAlgorithm):
             actions = self.policy.encode(th.as_tensor(self.policy.from_env(others), device=self.device))
         return actions
 
-    def _penalty(self, raw: list[th.Tensor], live: th.Tensor) -> th.Tensor | float:
-        """The weighted mean squares of the actors' raw outputs, per block (agents, batch, action), summed over agents."""
-        if self.actor_regularization == 0:
-            return 0.0
-        sizes = by_agent(self.actor.blocks, [output.square().mean(-1) for output in raw])  # (agents, batch)
-        return self.actor_regularization * live_mean(sizes, live).sum()
-
-    @th.no_grad()
     def _follow(self, targets: nn.Module, networks: nn.Module) -> None:
         """θ' ← τθ + (1 − τ)θ'"""
         for target, parameter in zip(self._parameters[targets], self._parameters[networks], strict=True):
@@ -400,15 +398,13 @@ class MADDPG(SaveableAlgorithm):
         """
         :raises NonFiniteError: names the learning agent whose loss, of (agents,), is not finite; no network has changed
         """
-        if not th.isfinite(losses.sum()):
+        if not math.isfinite(losses.sum().item()):
             names = [self.layout.agents[i] for i in self.agents]
             columns = {name: slice(i, i + 1) for i, name in enumerate(names)}
             require_finite_columns(f"{quantity} in update {self._n_updates:,}", losses.detach().cpu().numpy(), columns)
 
-    def _minimise(self, networks: StackedActors | StackedCritics | OwnObservationCritics, loss: th.Tensor) -> None:
-        if not all(stack.is_plain for stack in networks.stacks):  # plain stacks write their gradients anew
-            networks.optimizer.zero_grad()
-        loss.backward()
+    def _step(self, networks: StackedActors | CentralCritics) -> None:
+        """Move the networks along their gradients."""
         if self.max_grad_norm is not None:
             for stack in networks.stacks:
                 stack.clip_gradients(self.max_grad_norm)  # type: ignore[operator]
@@ -582,8 +578,3 @@ class MADDPG(SaveableAlgorithm):
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "actor.optimizer", "critic.optimizer"], []
-
-
-def live_mean(values: th.Tensor, live: th.Tensor) -> th.Tensor:
-    """Mean over the last axis of the entries where ``live`` is 1 (0 where none is)."""
-    return (values * live).sum(-1) / live.sum(-1).clamp(min=1.0)

@@ -17,9 +17,10 @@ from stable_baselines3.common.utils import ConstantSchedule, get_device
 from torch import nn
 from torch.nn import functional as F
 
+from sb3_kfcv.common.adam import LeanAdam
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.layout import AgentLayout
-from sb3_kfcv.common.stacked_networks import StackedMLP, at_most
+from sb3_kfcv.common.stacked_networks import Evaluation, StackedMLP, at_most
 from sb3_kfcv.saving.archive import open_archive, write_archive
 from sb3_kfcv.saving.parameters import check_network
 from sb3_kfcv.saving.saveable import refusals
@@ -36,7 +37,7 @@ class Block:
 
     def __init__(self, layout: AgentLayout, agents: Sequence[int], positions: Sequence[int]) -> None:
         self.agents = list(agents)
-        self.positions = th.tensor(list(positions))
+        self.positions = list(positions)
         self.obs_size = layout.obs_sizes[agents[0]]
         self.action_size = layout.action_sizes[agents[0]]
         self.obs_columns = _Columns([layout.obs_slices[i] for i in agents])
@@ -51,11 +52,17 @@ class Block:
         return [Block(layout, members, [list(agents).index(i) for i in members]) for members in shapes.values()]
 
 
-def by_agent(blocks: Sequence[Block], values: Sequence[th.Tensor]) -> th.Tensor:
-    """Values per block, (agents of the block, …) each, in the order of the learning agents: (agents, …)."""
+def by_agent(positions: Sequence[Sequence[int]], values: Sequence[th.Tensor]) -> th.Tensor:
+    """
+    Values of several runs of agents, (agents of the run, …) each, in the order of all learning agents: (agents, …).
+
+    :param positions: places of each run's agents among the learning agents
+    :param values: of each run
+    """
     if len(values) == 1:
         return values[0]
-    return th.cat(list(values))[th.cat([block.positions for block in blocks]).argsort()]
+    order = [position for run in positions for position in run]
+    return th.cat(list(values))[th.tensor(order).argsort()]
 
 
 class _Columns:
@@ -109,13 +116,7 @@ class StackedActors(nn.Module):
             n_networks = max(members) + 1 if members else len(block.agents)
             sizes = [block.obs_size, *net_arch, block.action_size]
             self.stacks.append(StackedMLP(n_networks, sizes, activation_fn, members=members))
-
-    def outputs(self, observations: th.Tensor) -> list[th.Tensor]:
-        """
-        :param observations: joint rows (batch, joint)
-        :return: per block (agents, batch, action): what the last layers give, before the tanh or the choice
-        """
-        return [stack(block.obs_columns.read(observations)) for stack, block in zip(self.stacks, self.blocks, strict=True)]
+        self._latest: list[tuple[th.Tensor, th.Tensor]] = []  # per block: outputs and actions of the latest evaluation
 
     def forward(self, observations: th.Tensor, explore: bool = False) -> list[th.Tensor]:
         """
@@ -125,24 +126,54 @@ class StackedActors(nn.Module):
         :param explore: discrete agents draw from their softmax instead of taking its maximum
         :return: per block (agents, batch, action)
         """
-        outputs = self.outputs(observations)
+        outputs = self._outputs(observations)
         if not self.layout.discrete:
             return [th.tanh(output) for output in outputs]
         if explore:
             outputs = [gumbel_perturbed(logits) for logits in outputs]
         return [F.one_hot(logits.argmax(-1), logits.shape[-1]).to(logits.dtype) for logits in outputs]
 
-    def relaxed(self, observations: th.Tensor, temperature: float) -> tuple[list[th.Tensor], list[th.Tensor]]:
+    def evaluate(self, observations: th.Tensor, temperature: float) -> list[th.Tensor]:
         """
-        Actions that carry a gradient: as they are, or straight-through Gumbel-softmax for discrete agents.
+        Actions that :meth:`backward` can follow: as they are, or by straight-through Gumbel-softmax for discrete agents.
 
+        :param observations: joint rows (batch, joint)
         :param temperature: of the Gumbel-softmax
-        :return: the actions, per block (agents, batch, action), and the raw outputs that they come from
+        :return: per block (agents, batch, action)
         """
-        outputs = self.outputs(observations)
+        outputs = self._outputs(observations)
         if not self.layout.discrete:
-            return [th.tanh(output) for output in outputs], outputs
-        return [F.gumbel_softmax(logits, tau=temperature, hard=True) for logits in outputs], outputs
+            actions = [th.tanh(output) for output in outputs]
+        else:
+            with th.enable_grad():
+                outputs = [logits.detach().requires_grad_() for logits in outputs]
+                actions = [F.gumbel_softmax(logits, tau=temperature, hard=True) for logits in outputs]
+        self._latest[:] = zip(outputs, actions, strict=True)
+        return [own.detach() for own in actions] if self.layout.discrete else actions
+
+    def backward(self, gradients: Sequence[th.Tensor], penalties: th.Tensor | None = None) -> None:
+        """
+        Write the gradients of the parameters, from the latest :meth:`evaluate`.
+
+        :param gradients: of the loss, at its actions; per block (agents, batch, action)
+        :param penalties: weight in the loss of each row's mean squared output before the tanh or the choice, (agents, batch)
+        """
+        for stack, block, (output, actions), gradient in zip(self.stacks, self.blocks, self._latest, gradients, strict=True):
+            if self.layout.discrete:
+                (at_output,) = th.autograd.grad(actions, output, gradient)
+                output = output.detach()
+            else:
+                at_output = th.ops.aten.tanh_backward(gradient, actions)
+            if penalties is not None:
+                at_output = at_output.addcmul_(output, penalties[block.positions].unsqueeze(-1), value=2 / output.shape[-1])
+            stack.backward(at_output)  # type: ignore[operator]
+
+    def _outputs(self, observations: th.Tensor) -> list[th.Tensor]:
+        """What the last layers give, per block (agents, batch, action)."""
+        return [
+            (stack if th.is_grad_enabled() else stack.evaluate)(block.obs_columns.read(observations))  # type: ignore[operator]
+            for stack, block in zip(self.stacks, self.blocks, strict=True)
+        ]
 
     def network(self, agent: int) -> nn.Sequential:
         """The network of one agent, as separate ``nn.Linear`` layers (a copy; its last layer is linear)."""
@@ -152,13 +183,15 @@ class StackedActors(nn.Module):
         raise ValueError(f"{self.layout.agents[agent]!r} is not among the learning agents")
 
 
-class StackedCritics(nn.Module):
+class CentralCritics(nn.Module):
     """
-    The learning agents' centralised critics Q_i(s, a_1 … a_N), all reading the same joint input.
+    The learning agents' critics Q_i, which see all actions a_1 … a_N beside what their kind sees of the world.
+
+    Agents whose critics stack are a *run*; its critics are :attr:`stacks`, critic after critic, run after run.
 
     :param layout: who sits where in the joint rows
     :param agents: the learning agents
-    :param critic_input: ``"observations"`` (of all agents) or ``"state"`` (the world's); the joint action comes after it
+    :param critic_input: a key of ``CRITIC_INPUTS``; in the inputs the joint action comes after it
     :param net_arch: hidden sizes
     :param activation_fn: activation between layers
     :param n_critics: critics per agent (2 for clipped double Q-learning)
@@ -178,129 +211,189 @@ class StackedCritics(nn.Module):
         share_parameters: bool = False,
     ) -> None:
         super().__init__()
+        self.layout = layout
         self.actions_start = layout.state_size if critic_input == "state" else sum(layout.obs_sizes)
         self.input_size = self.actions_start + sum(layout.action_sizes)
         self.blocks = Block.split(layout, agents)
-        members = shared_members(layout, agents) if share_parameters else None
-        n_networks = max(members) + 1 if members else len(agents)
-        order = ego_order(layout, agents, critic_input) if share_parameters else None
-        sizes = [self.input_size, *net_arch, 1]
-        self.stacks = nn.ModuleList(
-            StackedMLP(n_networks, sizes, activation_fn, n_inputs=1, members=members, input_order=order)
-            for _ in range(n_critics)
-        )
+        self.order = ego_order(layout, agents, critic_input) if share_parameters else None  # (agents, input)
+        self.positions = self._runs()
+        self.stacks = nn.ModuleList()
+        for _ in range(n_critics):
+            for run, positions in enumerate(self.positions):
+                members = shared_members(layout, [agents[i] for i in positions]) if share_parameters else None
+                n_networks = max(members) + 1 if members else len(positions)
+                self.stacks.append(self._stack(run, n_networks, net_arch, activation_fn, members))
+        self._places: list[tuple[int, list[int] | None]] = []  # of each block: its run, and its members there, None for all
+        for i, block in enumerate(self.blocks):
+            run = next(r for r, positions in enumerate(self.positions) if block.positions[0] in positions)
+            self._places.append((run, None if block.positions == self.positions[run] else block.positions))
+            self.register_buffer(f"_own_rows_{i}", self._own_rows(i, block), persistent=False)
+        # Of the latest evaluation of own actions: the stacks' evaluations, and per block the weights of the own action
+        self._moved: list[Evaluation] = []
+        self._own_weights: list[th.Tensor] = []
+
+    def _runs(self) -> list[list[int]]:
+        """Places among the learning agents of each run's agents."""
+        raise NotImplementedError
+
+    def _stack(
+        self, run: int, n_networks: int, net_arch: list[int], activation_fn: type[nn.Module], members: list[int] | None
+    ) -> StackedMLP:
+        """The critics of a run."""
+        raise NotImplementedError
+
+    def _read(self, inputs: th.Tensor) -> list[th.Tensor]:
+        """What the stacks of each run read."""
+        raise NotImplementedError
+
+    def _own_rows(self, i: int, block: Block) -> th.Tensor:
+        """Where the weights of a block's own actions stand, see :meth:`StackedMLP.first_layer_rows`."""
+        raise NotImplementedError
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
         """
         :param inputs: (batch, observations or state, then joint action)
         :return: Q-values (critics, agents, batch)
         """
-        return th.stack([stack(inputs.unsqueeze(0)).squeeze(-1) for stack in self.stacks])
+        return self._by_critic([stack(read) for stack, read in zip(self.stacks, self._reads(inputs), strict=True)])
 
-    def with_own_actions(self, inputs: th.Tensor, own_actions: list[th.Tensor]) -> th.Tensor:
+    def evaluate(self, inputs: th.Tensor) -> th.Tensor:
+        """As :meth:`forward`, and remembered for :meth:`backward`."""
+        reads = self._reads(inputs)
+        return self._by_critic([stack.evaluate(read) for stack, read in zip(self.stacks, reads, strict=True)])  # type: ignore[operator]
+
+    def backward(self, gradients: th.Tensor) -> None:
+        """
+        Write the gradients of the parameters, from the latest :meth:`evaluate`.
+
+        :param gradients: of the loss, at its Q-values (critics, agents, batch)
+        """
+        for i, stack in enumerate(self.stacks):
+            critic, run = divmod(i, len(self.positions))
+            stack.backward(self._of_run(gradients[critic], run).unsqueeze(-1))  # type: ignore[operator]
+
+    def evaluate_own_actions(self, inputs: th.Tensor, own_actions: Sequence[th.Tensor]) -> th.Tensor:
         """
         Q_i of each agent's first critic with the agent's own action replaced and all others as they are (eq. 6).
 
-        The first layer of all critics is computed once; an agent's new action moves its pre-activation by
-        (new − old) · (its own action columns). Gradients reach ``own_actions`` alone.
+        The first layer is computed as for the minibatch; an agent's new action moves its pre-activation by
+        (new − old) · (its own action's weights).
 
         :param inputs: (batch, observations or state, then joint action)
         :param own_actions: per block (agents, batch, action)
         :return: (agents, batch)
         """
-        stack: StackedMLP = self.stacks[0]  # type: ignore[assignment]
-        with th.no_grad():
-            z = stack.first_layer(inputs.unsqueeze(0))  # (agents, batch, hidden)
-        moved = []
-        for block, new in zip(self.blocks, own_actions, strict=True):
-            old = block.action_columns.read(inputs[:, self.actions_start :])
-            own_columns = stack.input_columns(block.positions, self.actions_start + block.action_columns.index)
-            moved.append(th.baddbmm(z[block.positions] if len(self.blocks) > 1 else z, new - old, own_columns))
-        return stack.after_first_layer(by_agent(self.blocks, moved), frozen=True).squeeze(-1)
+        read = self._read(inputs)
+        self._moved[:] = [stack.evaluation(len(inputs)) for stack in self.stacks[: len(read)]]  # type: ignore[operator, index]
+        self._own_weights[:] = [
+            self.stacks[run].first_layer_weights(getattr(self, f"_own_rows_{i}"))  # type: ignore[operator]
+            for i, (run, _) in enumerate(self._places)
+        ]
+        first = [evaluation.first_layer(own) for evaluation, own in zip(self._moved, read, strict=True)]
+        actions = inputs[:, self.actions_start :]
+        for (run, members), weights, block, new in zip(self._places, self._own_weights, self.blocks, own_actions, strict=True):
+            moved = new - block.action_columns.read(actions)
+            if members is None:
+                first[run].baddbmm_(moved, weights)
+            else:
+                first[run][members] += th.bmm(moved, weights)
+        return by_agent(self.positions, [evaluation.rest().squeeze(-1) for evaluation in self._moved])
+
+    def own_action_gradients(self, gradients: th.Tensor) -> list[th.Tensor]:
+        """
+        ∇_a of a loss of the Q-values of the latest :meth:`evaluate_own_actions`, through critics that stay as they are.
+
+        :param gradients: of the loss, at these Q-values (agents, batch)
+        :return: per block (agents, batch, action)
+        """
+        first = [
+            evaluation.backward(self._of_run(gradients, run).unsqueeze(-1), parameters=False)
+            for run, evaluation in enumerate(self._moved)
+        ]
+        return [
+            th.bmm(first[run] if members is None else first[run][members], weights.transpose(1, 2))
+            for (run, members), weights in zip(self._places, self._own_weights, strict=True)
+        ]
+
+    def _reads(self, inputs: th.Tensor) -> list[th.Tensor]:
+        """What each stack reads."""
+        return self._read(inputs) * (len(self.stacks) // len(self.positions))
+
+    def _by_critic(self, values: list[th.Tensor]) -> th.Tensor:
+        """Values of each stack (members, batch, 1) → (critics, agents, batch)."""
+        n_runs = len(self.positions)
+        critics = [by_agent(self.positions, values[i : i + n_runs]) for i in range(0, len(values), n_runs)]
+        return (critics[0].unsqueeze(0) if len(critics) == 1 else th.stack(critics)).squeeze(-1)
+
+    def _of_run(self, values: th.Tensor, run: int) -> th.Tensor:
+        """(agents, …) → those of a run."""
+        return values if len(self.positions) == 1 else values[self.positions[run]]
 
     def network(self, position: int, critic: int = 0) -> nn.Sequential:
         """One critic as separate ``nn.Linear`` layers (a copy); ``position`` counts the learning agents."""
-        return self.stacks[critic].network(position)  # type: ignore[operator]
-
-
-class OwnObservationCritics(nn.Module):
-    """
-    Critics Q_i(o_i, a_1 … a_N) that see their agent's own observation and all actions. Where the agent sees the whole
-    world from its own place, nothing is lost, the input is many times smaller than all observations together, and what
-    counts (how far is the nearest sheep?) need not be worked out from absolute positions.
-
-    The parameters are those of :class:`StackedCritics`; inputs are all observations, then the joint action.
-    """
-
-    optimizer: th.optim.Optimizer
-
-    def __init__(
-        self,
-        layout: AgentLayout,
-        agents: Sequence[int],
-        critic_input: str,
-        net_arch: list[int],
-        activation_fn: type[nn.Module] = nn.ReLU,
-        n_critics: int = 1,
-        share_parameters: bool = False,
-    ) -> None:
-        super().__init__()
-        n_actions = sum(layout.action_sizes)
-        self.actions_start = sum(layout.obs_sizes)
-        self.blocks = Block.split(layout, agents)
-        order = ego_order(layout, agents, critic_input) if share_parameters else th.arange(n_actions).repeat(len(agents), 1)
-        self.read_order = [order[block.positions].argsort(1) for block in self.blocks]  # (agents, joint action)
-        self.own_slots = [  # (agents, action) in the input of the networks
-            block.obs_size + order[block.positions].gather(1, block.action_columns.index) for block in self.blocks
-        ]
-        self.stacks = nn.ModuleList()  # critic after critic, block after block
-        for _ in range(n_critics):
-            for block in self.blocks:
-                members = shared_members(layout, block.agents) if share_parameters else None
-                n_networks = max(members) + 1 if members else len(block.agents)
-                sizes = [block.obs_size + n_actions, *net_arch, 1]
-                self.stacks.append(StackedMLP(n_networks, sizes, activation_fn, members=members))
-
-    def forward(self, inputs: th.Tensor) -> th.Tensor:
-        """
-        :param inputs: (batch, all observations, then joint action)
-        :return: Q-values (critics, agents, batch)
-        """
-        read = self._read(inputs)
-        values = [stack(read[i % len(read)]).squeeze(-1) for i, stack in enumerate(self.stacks)]
-        critics = [values[first : first + len(read)] for first in range(0, len(values), len(read))]
-        return th.stack([by_agent(self.blocks, critic) for critic in critics])
-
-    def with_own_actions(self, inputs: th.Tensor, own_actions: list[th.Tensor]) -> th.Tensor:
-        """See :meth:`StackedCritics.with_own_actions`."""
-        values = []
-        for i, (block, read, new) in enumerate(zip(self.blocks, self._read(inputs), own_actions, strict=True)):
-            stack: StackedMLP = self.stacks[i]  # type: ignore[assignment]
-            with th.no_grad():
-                z = stack.first_layer(read)
-            old = block.action_columns.read(inputs[:, self.actions_start :])
-            own_columns = stack.input_columns(th.arange(len(block.agents)), self.own_slots[i])
-            values.append(stack.after_first_layer(th.baddbmm(z, new - old, own_columns), frozen=True).squeeze(-1))
-        return by_agent(self.blocks, values)
-
-    def network(self, position: int, critic: int = 0) -> nn.Sequential:
-        """One critic as separate layers (a copy); it reads the own observation, then the actions in its ``read_order``."""
-        for i, block in enumerate(self.blocks):
-            if position in block.positions:
-                stack = self.stacks[critic * len(self.blocks) + i]
-                return stack.network(block.positions.tolist().index(position))  # type: ignore[operator]
+        for run, positions in enumerate(self.positions):
+            if position in positions:
+                return self.stacks[critic * len(self.positions) + run].network(positions.index(position))  # type: ignore[operator]
         raise ValueError(f"there is no learning agent {position}")
 
+
+class StackedCritics(CentralCritics):
+    """
+    Q_i(s, a_1 … a_N) with s the observations of all agents, or the world's state: all read the same joint input, and the
+    first layers of all are one product.
+    """
+
+    def _runs(self) -> list[list[int]]:
+        return [sorted(position for block in self.blocks for position in block.positions)]
+
+    def _stack(
+        self, run: int, n_networks: int, net_arch: list[int], activation_fn: type[nn.Module], members: list[int] | None
+    ) -> StackedMLP:
+        sizes = [self.input_size, *net_arch, 1]
+        return StackedMLP(n_networks, sizes, activation_fn, common_input=True, members=members, input_order=self.order)
+
     def _read(self, inputs: th.Tensor) -> list[th.Tensor]:
-        """What the networks of each block read: (agents, batch, own observation and all actions)."""
+        return [inputs.unsqueeze(0)]
+
+    def _own_rows(self, i: int, block: Block) -> th.Tensor:
+        return self.stacks[0].first_layer_rows(block.positions, self.actions_start + block.action_columns.index)  # type: ignore[operator]
+
+
+class OwnObservationCritics(CentralCritics):
+    """
+    Q_i(o_i, a_1 … a_N): the agent's own observation and all actions. Where the agent sees the whole world from its own
+    place, nothing is lost, the input is many times smaller than all observations together, and what counts (how far is the
+    nearest sheep?) need not be worked out from absolute positions. The inputs are all observations, then the joint action.
+    """
+
+    def _runs(self) -> list[list[int]]:
+        n_actions = sum(self.layout.action_sizes)
+        n_agents = sum(len(block.agents) for block in self.blocks)
+        order = th.arange(n_actions).repeat(n_agents, 1) if self.order is None else self.order  # (agents, joint action)
+        self.action_order = [order[block.positions] for block in self.blocks]  # the input that takes each action
+        self.read_order = [taken.argsort(1) for taken in self.action_order]  # what each input takes
+        return [block.positions for block in self.blocks]
+
+    def _stack(
+        self, run: int, n_networks: int, net_arch: list[int], activation_fn: type[nn.Module], members: list[int] | None
+    ) -> StackedMLP:
+        sizes = [self.blocks[run].obs_size + sum(self.layout.action_sizes), *net_arch, 1]
+        return StackedMLP(n_networks, sizes, activation_fn, members=members)
+
+    def _read(self, inputs: th.Tensor) -> list[th.Tensor]:
+        """The own observation, then the actions in :attr:`read_order`; per block (agents, batch, input)."""
         actions = inputs[:, self.actions_start :]
         return [
             th.cat([block.obs_columns.read(inputs[:, : self.actions_start]), actions[:, order].transpose(0, 1)], dim=-1)
             for block, order in zip(self.blocks, self.read_order, strict=True)
         ]
 
+    def _own_rows(self, i: int, block: Block) -> th.Tensor:
+        own = block.obs_size + self.action_order[i].gather(1, block.action_columns.index)
+        return self.stacks[i].first_layer_rows(range(len(block.agents)), own)  # type: ignore[operator]
 
-CRITIC_INPUTS: dict[str, type[StackedCritics] | type[OwnObservationCritics]] = {
+
+CRITIC_INPUTS: dict[str, type[CentralCritics]] = {
     "observations": StackedCritics,
     "state": StackedCritics,
     "own_observation": OwnObservationCritics,
@@ -365,8 +458,8 @@ class MADDPGPolicy(BasePolicy):
 
     actor: StackedActors
     actor_target: StackedActors
-    critic: StackedCritics | OwnObservationCritics
-    critic_target: StackedCritics | OwnObservationCritics
+    critic: CentralCritics
+    critic_target: CentralCritics
 
     def __init__(
         self,
@@ -410,7 +503,7 @@ class MADDPGPolicy(BasePolicy):
         def make_actor() -> StackedActors:
             return StackedActors(layout, agents, actor_arch, activation_fn, share_parameters)
 
-        def make_critic() -> StackedCritics | OwnObservationCritics:
+        def make_critic() -> CentralCritics:
             return CRITIC_INPUTS[critic_input](
                 layout, agents, critic_input, critic_arch, activation_fn, n_critics, share_parameters
             )
@@ -420,7 +513,11 @@ class MADDPGPolicy(BasePolicy):
         for network, target in ((self.actor, self.actor_target), (self.critic, self.critic_target)):
             target.load_state_dict(network.state_dict())
             target.requires_grad_(False)
-            network.optimizer = optimizer_class(network.parameters(), lr=lr_schedule(1), **optimizer_kwargs)  # type: ignore[call-arg]
+            for target_stack, stack in zip(target.stacks, network.stacks, strict=True):
+                target_stack.borrow(stack)  # type: ignore[operator]
+            fused = optimizer_class is th.optim.Adam and optimizer_kwargs.get("fused")
+            fastest = LeanAdam if fused else optimizer_class
+            network.optimizer = fastest(network.parameters(), lr=lr_schedule(1), **optimizer_kwargs)  # type: ignore[call-arg]
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic=deterministic)
@@ -439,8 +536,11 @@ class MADDPGPolicy(BasePolicy):
         :param explore: discrete agents draw from their softmax instead of taking its maximum
         :return: (batch, joint action)
         """
+        chosen = actors(observations, explore)
+        if len(actors.blocks) == 1 and len(actors.blocks[0].agents) == self.layout.n_agents:
+            return chosen[0].transpose(0, 1).flatten(1)
         rows = observations.new_zeros(len(observations), sum(self.layout.action_sizes))
-        for block, actions in zip(actors.blocks, actors(observations, explore), strict=True):
+        for block, actions in zip(actors.blocks, chosen, strict=True):
             block.action_columns.write(rows, actions)
         return rows
 
@@ -492,6 +592,8 @@ class MADDPGPolicy(BasePolicy):
         return actions if np.ndim(observation) > 1 else actions[0]
 
     def set_training_mode(self, mode: bool) -> None:
+        if mode == self.training:
+            return
         self.actor.train(mode)
         self.critic.train(mode)
         self.training = mode

@@ -1,0 +1,82 @@
+"""Our Adam is PyTorch's, number for number."""
+
+import copy
+
+import pytest
+import torch as th
+
+from sb3_kfcv.common.adam import LeanAdam
+
+SETTINGS = {
+    "defaults": {},
+    "weight decay": {"weight_decay": 0.1},
+    "betas and eps": {"betas": (0.5, 0.9), "eps": 1e-3},
+    "maximise": {"maximize": True},
+    "AMSGrad": {"amsgrad": True},
+    "not fused": {"fused": False},
+}
+
+
+def parameters():
+    th.manual_seed(0)
+    return [th.nn.Parameter(th.randn(*shape)) for shape in ((3, 4, 5), (3, 1, 5), (1,))]
+
+
+def optimiser(cls, **kwargs):
+    return cls(parameters(), **{"lr": 1e-2, "fused": True, **kwargs})
+
+
+def step(optimizer, seed):
+    th.manual_seed(seed)
+    for parameter in optimizer.param_groups[0]["params"]:
+        parameter.grad = th.randn_like(parameter)
+    optimizer.step()
+
+
+def equal(one, other):
+    ours, theirs = one.state_dict(), other.state_dict()
+    assert ours["param_groups"] == theirs["param_groups"]
+    for mine, its in zip(one.param_groups[0]["params"], other.param_groups[0]["params"], strict=True):
+        assert th.equal(mine, its)
+    for key, state in theirs["state"].items():
+        assert all(th.equal(ours["state"][key][name], value) for name, value in state.items())
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+def test_steps_and_state_are_those_of_pytorch(settings):
+    ours, theirs = (optimiser(cls, **SETTINGS[settings]) for cls in (LeanAdam, th.optim.Adam))
+    for seed in range(5):
+        for optimizer in (ours, theirs):
+            optimizer.param_groups[0]["lr"] = 0.01 * (seed + 1)
+            step(optimizer, seed)
+        equal(ours, theirs)
+
+
+def test_a_loaded_state_goes_on():
+    """The tensors that were found before are not those of the state that was loaded."""
+    ours, theirs = optimiser(LeanAdam), optimiser(th.optim.Adam)
+    for seed in range(3):
+        step(theirs, seed)
+    step(ours, 9)
+    step(ours, 9)
+    ours.load_state_dict(copy.deepcopy(theirs.state_dict()))
+    with th.no_grad():
+        for mine, its in zip(ours.param_groups[0]["params"], theirs.param_groups[0]["params"], strict=True):
+            mine.copy_(its)
+    for seed in range(3, 6):
+        step(ours, seed)
+        step(theirs, seed)
+        equal(ours, theirs)
+
+
+def test_a_closure_is_evaluated():
+    optimizer = optimiser(LeanAdam)
+
+    def closure():
+        optimizer.zero_grad()
+        loss = sum(parameter.square().sum() for parameter in optimizer.param_groups[0]["params"])
+        loss.backward()
+        return loss
+
+    losses = [optimizer.step(closure).item() for _ in range(20)]
+    assert losses[-1] < losses[0]
