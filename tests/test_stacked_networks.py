@@ -282,7 +282,8 @@ def test_critics_of_own_observations_equal_separate_networks(share):
         moved = actions.clone()
         moved[:, layout.action_slices[agent]] = own[agent // 2][agent % 2]
         theirs = critics.network(agent)(th.cat([seen, moved[:, order]], dim=1)).squeeze(1)
-        close(critics.evaluate_own_actions(inputs, own)[agent], theirs)
+        critics.evaluate(inputs)
+        close(critics.evaluate_own_actions(own)[agent], theirs)
 
 
 def test_actors_equal_separate_sb3_actors(layout):
@@ -338,7 +339,8 @@ def test_own_action_replaced_equals_a_plain_evaluation_and_its_gradient(layout, 
     inputs = th.randn(5, n_obs + sum(layout.action_sizes))
     new = {i: th.randn(5, layout.action_sizes[i], requires_grad=True) for i in range(layout.n_agents)}
 
-    q_values = critics.evaluate_own_actions(inputs, [own.detach() for own in in_blocks(critics, new)])
+    critics.evaluate(inputs)
+    q_values = critics.evaluate_own_actions([own.detach() for own in in_blocks(critics, new)])
     weights = th.randn_like(q_values)
     gradients = {
         agent: gradient
@@ -361,7 +363,8 @@ def test_own_action_replaced_for_some_of_the_agents():
     n_obs = sum(layout.obs_sizes)
     inputs = th.randn(5, n_obs + sum(layout.action_sizes))
     new = {i: th.randn(5, layout.action_sizes[i]) for i in (1, 3)}
-    q_values = critics.evaluate_own_actions(inputs, in_blocks(critics, new))
+    critics.evaluate(inputs)
+    q_values = critics.evaluate_own_actions(in_blocks(critics, new))
     for position, i in enumerate((1, 3)):
         moved = inputs.clone()
         moved[:, n_obs:][:, layout.action_slices[i]] = new[i]
@@ -372,7 +375,8 @@ def test_the_actors_step_gives_the_critics_no_gradient(layout):
     critics = critics_of(layout)
     inputs = th.randn(5, sum(layout.obs_sizes) + sum(layout.action_sizes))
     new = {i: th.randn(5, layout.action_sizes[i]) for i in range(layout.n_agents)}
-    critics.own_action_gradients(th.ones_like(critics.evaluate_own_actions(inputs, in_blocks(critics, new))))
+    critics.evaluate(inputs)
+    critics.own_action_gradients(th.ones_like(critics.evaluate_own_actions(in_blocks(critics, new))))
     assert all(parameter.grad is None for parameter in critics.parameters())
 
 

@@ -309,14 +309,14 @@ class MADDPG(SaveableAlgorithm):
             errors = targets - self.critic.evaluate(inputs)  # (critics, agents, batch)
             weighted = errors * (share * batch.weights)
             critic_losses = (weighted * errors).sum(-1)  # (critics, agents)
-            self._check_losses("critic loss", critic_losses.sum(0))
+            self._check_losses("critic loss", critic_losses)
             self.critic.backward(weighted.mul_(-2))
             self._step(self.critic)
 
             # Eq. 6: ascend Q(s, a_1 … π_i(o_i) … a_N)
             if self._n_updates % self.policy_delay == 0:
                 own_actions = self.actor.evaluate(batch.observations, self.gumbel_temperature)
-                actor_losses = -(self.critic.evaluate_own_actions(inputs, own_actions) * share).sum(-1)  # (agents,)
+                actor_losses = -(self.critic.evaluate_own_actions(own_actions) * share).sum(-1)  # (agents,)
                 self._check_losses("actor loss", actor_losses)
                 penalties = self.actor_regularization * share if self.actor_regularization > 0 else None
                 self.actor.backward(self.critic.own_action_gradients(-share), penalties)
@@ -396,12 +396,13 @@ class MADDPG(SaveableAlgorithm):
 
     def _check_losses(self, quantity: str, losses: th.Tensor) -> None:
         """
-        :raises NonFiniteError: names the learning agent whose loss, of (agents,), is not finite; no network has changed
+        :param losses: (agents,) or (critics, agents)
+        :raises NonFiniteError: names the learning agent whose loss is not finite; no network has changed
         """
         if not math.isfinite(losses.sum().item()):
-            names = [self.layout.agents[i] for i in self.agents]
-            columns = {name: slice(i, i + 1) for i, name in enumerate(names)}
-            require_finite_columns(f"{quantity} in update {self._n_updates:,}", losses.detach().cpu().numpy(), columns)
+            columns = {self.layout.agents[agent]: slice(i, i + 1) for i, agent in enumerate(self.agents)}
+            rows = losses.cpu().numpy().reshape(-1, len(columns))
+            require_finite_columns(f"{quantity} in update {self._n_updates:,}", rows, columns)
 
     def _step(self, networks: StackedActors | CentralCritics) -> None:
         """Move the networks along their gradients."""

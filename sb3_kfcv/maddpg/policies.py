@@ -228,6 +228,7 @@ class CentralCritics(nn.Module):
             run = next(r for r, positions in enumerate(self.positions) if block.positions[0] in positions)
             self._places.append((run, None if block.positions == self.positions[run] else block.positions))
             self.register_buffer(f"_own_rows_{i}", self._own_rows(i, block), persistent=False)
+        self._inputs: list[th.Tensor] = []  # of the latest evaluation
         # Of the latest evaluation of own actions: the stacks' evaluations, and per block the weights of the own action
         self._moved: list[Evaluation] = []
         self._own_weights: list[th.Tensor] = []
@@ -259,6 +260,7 @@ class CentralCritics(nn.Module):
 
     def evaluate(self, inputs: th.Tensor) -> th.Tensor:
         """As :meth:`forward`, and remembered for :meth:`backward`."""
+        self._inputs[:] = [inputs]
         reads = self._reads(inputs)
         return self._by_critic([stack.evaluate(read) for stack, read in zip(self.stacks, reads, strict=True)])  # type: ignore[operator]
 
@@ -272,24 +274,25 @@ class CentralCritics(nn.Module):
             critic, run = divmod(i, len(self.positions))
             stack.backward(self._of_run(gradients[critic], run).unsqueeze(-1))  # type: ignore[operator]
 
-    def evaluate_own_actions(self, inputs: th.Tensor, own_actions: Sequence[th.Tensor]) -> th.Tensor:
+    def evaluate_own_actions(self, own_actions: Sequence[th.Tensor]) -> th.Tensor:
         """
-        Q_i of each agent's first critic with the agent's own action replaced and all others as they are (eq. 6).
+        Q_i of each agent's first critic at the inputs of the latest :meth:`evaluate`, with the agent's own action replaced and
+        all others as they are (eq. 6).
 
         The first layer is computed as for the minibatch; an agent's new action moves its pre-activation by
         (new − old) · (its own action's weights).
 
-        :param inputs: (batch, observations or state, then joint action)
         :param own_actions: per block (agents, batch, action)
         :return: (agents, batch)
         """
-        read = self._read(inputs)
-        self._moved[:] = [stack.evaluation(len(inputs)) for stack in self.stacks[: len(read)]]  # type: ignore[operator, index]
+        (inputs,) = self._inputs
+        stacks = [self.stacks[run] for run in range(len(self.positions))]
+        self._moved[:] = [stack.evaluation(len(inputs)) for stack in stacks]  # type: ignore[operator]
         self._own_weights[:] = [
             self.stacks[run].first_layer_weights(getattr(self, f"_own_rows_{i}"))  # type: ignore[operator]
             for i, (run, _) in enumerate(self._places)
         ]
-        first = [evaluation.first_layer(own) for evaluation, own in zip(self._moved, read, strict=True)]
+        first = [evaluation.first_layer(evaluation.x) for evaluation in self._moved]
         actions = inputs[:, self.actions_start :]
         for (run, members), weights, block, new in zip(self._places, self._own_weights, self.blocks, own_actions, strict=True):
             moved = new - block.action_columns.read(actions)
@@ -367,11 +370,11 @@ class OwnObservationCritics(CentralCritics):
     """
 
     def _runs(self) -> list[list[int]]:
-        n_actions = sum(self.layout.action_sizes)
-        n_agents = sum(len(block.agents) for block in self.blocks)
-        order = th.arange(n_actions).repeat(n_agents, 1) if self.order is None else self.order  # (agents, joint action)
-        self.action_order = [order[block.positions] for block in self.blocks]  # the input that takes each action
-        self.read_order = [taken.argsort(1) for taken in self.action_order]  # what each input takes
+        for i, block in enumerate(self.blocks):
+            order = (
+                None if self.order is None else self.order[block.positions]
+            )  # (agents, input): the input that takes each action
+            self.register_buffer(f"_read_order_{i}", None if order is None else order.argsort(1).flatten(), persistent=False)
         return [block.positions for block in self.blocks]
 
     def _stack(
@@ -381,16 +384,22 @@ class OwnObservationCritics(CentralCritics):
         return StackedMLP(n_networks, sizes, activation_fn, members=members)
 
     def _read(self, inputs: th.Tensor) -> list[th.Tensor]:
-        """The own observation, then the actions in :attr:`read_order`; per block (agents, batch, input)."""
-        actions = inputs[:, self.actions_start :]
-        return [
-            th.cat([block.obs_columns.read(inputs[:, : self.actions_start]), actions[:, order].transpose(0, 1)], dim=-1)
-            for block, order in zip(self.blocks, self.read_order, strict=True)
-        ]
+        """The own observation, then all actions in the order in which each agent reads them: (agents, batch, input)."""
+        read = []
+        for i, block in enumerate(self.blocks):
+            actions, order = inputs[:, self.actions_start :], getattr(self, f"_read_order_{i}")
+            if order is None:
+                actions = actions.expand(len(block.agents), -1, -1)
+            else:
+                actions = actions.index_select(1, order).unflatten(1, (len(block.agents), -1)).transpose(0, 1)
+            read.append(th.cat([block.obs_columns.read(inputs), actions], dim=-1))
+        return read
 
     def _own_rows(self, i: int, block: Block) -> th.Tensor:
-        own = block.obs_size + self.action_order[i].gather(1, block.action_columns.index)
-        return self.stacks[i].first_layer_rows(range(len(block.agents)), own)  # type: ignore[operator]
+        own = block.action_columns.index
+        if self.order is not None:
+            own = self.order[block.positions].gather(1, own)
+        return self.stacks[i].first_layer_rows(range(len(block.agents)), block.obs_size + own)  # type: ignore[operator]
 
 
 CRITIC_INPUTS: dict[str, type[CentralCritics]] = {
