@@ -5,10 +5,11 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 CODE = sb3_kfcv zoo tests benchmarks setup.py
 
-.PHONY: help demo test test-expensive benchmark benchmark-peers format check-format lint type commit-checks docs clean
+.PHONY: help demo test test-expensive benchmark benchmark-scale benchmark-training benchmark-peers benchmark-report \
+	format check-format lint type commit-checks docs clean
 
 help:  ## Show the targets
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 18
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 20
 
 # torch first: other packages name ranges of it that would pull another build.
 $(VENV)/.installed: setup.py constraints.txt
@@ -29,8 +30,17 @@ test-expensive: $(VENV)/.installed  ## Run the long tests: learning to a thresho
 benchmark: $(VENV)/.installed  ## Measure how fast we are (some minutes; best on an idle machine)
 	$(BIN)/python benchmarks/speed.py
 
+benchmark-scale: $(VENV)/.installed  ## Measure how time and memory grow, and draw it (ten minutes)
+	$(BIN)/python benchmarks/scale.py
+
+benchmark-training: $(VENV)/.installed  ## Measure a tenth of the paper's trainings, and project the whole (half an hour)
+	$(BIN)/python benchmarks/full_training.py
+
 benchmark-peers: $(VENV)/.installed  ## Measure ours beside the peers (under an hour, gigabytes; builds their environments)
 	$(BIN)/python benchmarks/compare.py
+
+benchmark-report: $(VENV)/.installed  ## Write what was measured into docs/performance.md
+	$(BIN)/python benchmarks/report.py
 
 format: $(VENV)/.installed  ## Sort imports, format the code
 	$(BIN)/ruff check --select I --fix $(CODE)

@@ -6,14 +6,16 @@ Ours beside the peers: the same work, alternating process by process (ours, thei
     python benchmarks/compare.py --quick                           # does everything run? one short process of each
 
 Each peer has an environment of its own under ``.peers/``, built from ``benchmarks/peers/requirements/`` when it is not there;
-one that cannot be built or run is told in the table and stops nothing. A process warms up, times a few blocks and gives
-their median; the table has the median and the range of these over the processes, and the ratio of the two medians.
+one that cannot be built or run is told in the table and stops nothing. A process does the cases of one kind one after the
+other: of each it warms up, times a few blocks and gives their median; the table has the median and the range of these over
+the processes, and the ratio of the two medians.
 Writes ``docs/results/peers.md`` and, with every block, ``docs/results/peers.json``.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import statistics
@@ -21,11 +23,12 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from peers.protocol import CASES, cpu_model, in_units
+from peers.protocol import CASES, FAMILIES, N_WORLDS, cpu_model, in_units
 
 from sb3_kfcv.saving.files import atomic_write
 
@@ -50,6 +53,12 @@ VARIANTS: dict[str, dict[str, str]] = {
     }
 }
 """Cases that ours does in several ways: case of ours → what differs. The first is the same work as the peers'."""
+GROUPS: list[list[str]] = [
+    *([*FAMILIES[kind]] for kind in ("update", "predict", "spread", "tag")),
+    [case for case in CASES if case.startswith(("uniform-", "per-"))],
+    *([case] for case in FAMILIES["train"]),
+]
+"""Cases that one process does one after the other."""
 ONE_THREAD = {
     name: "1"
     for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -80,7 +89,13 @@ class Side:
     versions: dict[str, str] = field(default_factory=dict)
 
     def take(self, result: dict[str, Any]) -> None:
-        """Add what a process printed."""
+        """
+        Add what a process printed.
+
+        :raises Failed: if that is an error
+        """
+        if "error" in result:
+            raise Failed(f"stopped: {last_line(result['error'])}")
         self.medians.append(result["median"])
         self.blocks.append(result["seconds"])
         self.note, self.versions = result["note"], result["versions"]
@@ -118,9 +133,14 @@ class Pair:
         notes = [f"theirs: {self.theirs.note}"] if self.theirs.note else []
         notes += [f"ours: {self.ours.note}"] if self.ours.note else []
         notes += [self.variant] if self.variant else []
-        ratio = self.theirs.median / self.ours.median
-        times = f"{ratio:,.0f}×" if ratio >= 100 else f"{ratio:.1f}×"
-        return f"| {PEERS[self.peer]} | {self.theirs} | {self.ours} | **{times}** | {'. '.join(notes)} |"
+        ratio = times(self.theirs.median / self.ours.median)
+        return f"| {PEERS[self.peer]} | {self.theirs} | {self.ours} | **{ratio}** | {'. '.join(notes)} |"
+
+    def in_brief(self) -> str:
+        """Its cell in a table with a column per peer."""
+        if self.error:
+            return "no figure"
+        return f"{in_units(self.theirs.median)} (**{times(self.theirs.median / self.ours.median)}**)"
 
 
 def python_of(peer: str) -> Path:
@@ -178,45 +198,97 @@ def run(python: str | Path, adapter: Path, *arguments: str) -> str:
     return done.stdout
 
 
-def measure(python: str | Path, adapter: Path, case: str, blocks: int, block_seconds: float) -> dict[str, Any]:
-    """The result of one process."""
-    printed = run(python, adapter, case, "--repeats", str(blocks), "--block-seconds", str(block_seconds))
-    return json.loads(printed.splitlines()[-1])
+def measure(python: str | Path, adapter: Path, cases: Sequence[str], blocks: int, block_seconds: float) -> dict[str, Any]:
+    """Case → the result of one process."""
+    printed = run(python, adapter, *cases, "--repeats", str(blocks), "--block-seconds", str(block_seconds))
+    results = [json.loads(line) for line in printed.splitlines() if line.startswith('{"case"')]
+    return {result["case"]: result for result in results}
 
 
-def compare(case: str, peer: str, repeats: int, blocks: int, block_seconds: float) -> list[Pair]:
-    """Ours and a peer's processes in turn; a pair for each way that ours does the case."""
-    variants = VARIANTS.get(case, {case: ""})
-    pairs = [Pair(case, peer, variant) for variant in variants.values()]
-    theirs = Side()
+def compare(cases: Sequence[str], peer: str, repeats: int, blocks: int, block_seconds: float) -> list[Pair]:
+    """Ours and a peer's processes in turn; a pair for each case, and for each way that ours does it."""
+    pairs = {ours: Pair(case, peer, what) for case in cases for ours, what in VARIANTS.get(case, {case: ""}).items()}
+    theirs = {case: Side() for case in cases}
+    adapter = ADAPTERS / f"adapter_{peer}.py"
     try:
         for _ in range(repeats):
-            for ours_case, pair in zip(variants, pairs, strict=True):
-                pair.ours.take(measure(sys.executable, ROOT / "benchmarks" / "ours.py", ours_case, blocks, block_seconds))
-            theirs.take(measure(python_of(peer), ADAPTERS / f"adapter_{peer}.py", case, blocks, block_seconds))
+            measured = measure(sys.executable, ROOT / "benchmarks" / "ours.py", [*pairs], blocks, block_seconds)
+            for case, pair in pairs.items():
+                pair.ours.take(measured[case])
+            measured = measure(python_of(peer), adapter, cases, blocks, block_seconds)
+            for case, side in theirs.items():
+                with noting(pairs, case):
+                    side.take(measured[case])
     except Failed as failure:
-        return [Pair(case, peer, error=str(failure))]
-    for pair in pairs:
-        pair.theirs = theirs
-    return pairs
+        return [Pair(case, peer, error=str(failure)) for case in cases]
+    for pair in pairs.values():
+        pair.theirs = theirs[pair.case]
+    return [*pairs.values()]
+
+
+@contextlib.contextmanager
+def noting(pairs: dict[str, Pair], case: str) -> Iterator[None]:
+    """A case that fails is noted in its pairs, and stops no other."""
+    try:
+        yield
+    except Failed as failure:
+        for pair in pairs.values():
+            if pair.case == case:
+                pair.error = str(failure)
+
+
+def best_batches(pairs: list[Pair]) -> list[str]:
+    """A table of the simulations: each side at the number of worlds at which it is fastest."""
+    lines = []
+    for world in N_WORLDS:
+        of_world = [pair for pair in pairs if pair.case in FAMILIES[world] and not pair.error]
+        if not of_world:
+            continue
+        fastest = min(of_world, key=lambda pair: pair.ours.median)
+        for peer in PEERS:
+            of_peer = [pair for pair in of_world if pair.peer == peer]
+            if of_peer:
+                theirs = min(of_peer, key=lambda pair: pair.theirs.median)
+                ours = next((pair for pair in of_peer if pair.case == fastest.case), fastest)  # in turn with theirs
+                ratio = f"**{times(theirs.theirs.median / ours.ours.median)}**"
+                sides = [f"{side}, worlds: {worlds_of(pair):,}" for side, pair in ((theirs.theirs, theirs), (ours.ours, ours))]
+                lines.append(f"| {world} | {PEERS[peer]} | {sides[0]} | {sides[1]} | {ratio} |")
+    if not lines:
+        return []
+    return ["| world | peer | theirs, per env step | ours | ratio |", "|---|---|---|---|---|", *lines]
+
+
+def worlds_of(pair: Pair) -> int:
+    """How many worlds a simulation steps together."""
+    return int(pair.case.rsplit("-", 1)[1])
+
+
+def times(ratio: float) -> str:
+    """How many times as long."""
+    return f"{ratio:,.0f}×" if ratio >= 100 else f"{ratio:.1f}×"
+
+
+def conditions(facts: dict[str, Any]) -> str:
+    """How and where it was measured."""
+    return (
+        f"{facts['processor']}, {facts['cores']} cores, {facts['date']}; load before and after: {facts['load']}. "
+        f"Processes of each side, in turn: {facts['repeats']}, of 1 thread and {facts['blocks']} timed blocks of each case. "
+        "Seconds per operation: median [min–max] over the processes; the ratio is theirs over ours. "
+        "Updates: batch 128 of a buffer of 5,000, sampling included, networks 64-64 of each agent's own. "
+        "Made by `make benchmark-peers`; how each peer is driven stands in its adapter in `benchmarks/peers/`."
+    )
 
 
 def report(pairs: list[Pair], broken: dict[str, str], facts: dict[str, Any]) -> str:
-    """The page: a table per case, then the peers without figures and all versions."""
-    lines = [
-        "# Ours beside the peers",
-        "",
-        f"{facts['processor']}, {facts['cores']} cores, {facts['date']}; load before and after: {facts['load']}. "
-        f"Processes of each side, in turn: {facts['repeats']}, of 1 thread and {facts['blocks']} timed blocks each. "
-        "Seconds per operation: median [min–max] over the processes; the ratio is theirs over ours. "
-        "Updates: batch 128 of a buffer of 5,000, sampling included, networks 64-64 of each agent's own. "
-        "Made by `make benchmark-peers`; how each peer is driven stands in its adapter in `benchmarks/peers/`.",
-    ]
+    """The page: a table per case, each side at its best batch, then the peers without figures and all versions."""
+    lines = ["# Ours beside the peers", "", conditions(facts)]
     for case, title in CASES.items():
         of_case = [pair for pair in pairs if pair.case == case]
         if of_case:
             lines += ["", f"## {title[0].upper()}{title[1:]}", "", "| peer | theirs | ours | ratio | what differs |"]
             lines += ["|---|---|---|---|---|", *(pair.line() for pair in of_case)]
+    if best := best_batches(pairs):
+        lines += ["", "## Simulation, each side with as many worlds as it is fastest with", "", *best]
     if broken:
         lines += ["", "## Without figures", "", "| peer | why |", "|---|---|"]
         lines += [f"| {PEERS[peer]} | {reason} |" for peer, reason in broken.items()]
@@ -229,6 +301,37 @@ def report(pairs: list[Pair], broken: dict[str, str], facts: dict[str, Any]) -> 
         if versions:
             lines.append(f"| {name} | {', '.join(f'{package} {number}' for package, number in versions.items())} |")
     return "\n".join(lines) + "\n"
+
+
+def overview(results: dict[str, Any]) -> str:
+    """
+    One Markdown table of what was written: a line per case, and per way that ours does it.
+
+    :param results: what was written as JSON
+    """
+    pairs = pairs_of(results)
+    peers = [peer for peer in PEERS if any(pair.peer == peer for pair in pairs)]
+    lines = ["| work | ours | " + " | ".join(PEERS[peer] for peer in peers) + " |", "|---" * (len(peers) + 2) + "|"]
+    for case, variant in dict.fromkeys((pair.case, pair.variant) for pair in pairs):
+        of_row = {pair.peer: pair for pair in pairs if (pair.case, pair.variant) == (case, variant)}
+        medians = [median for pair in of_row.values() if not pair.error for median in pair.ours.medians]
+        ours = in_units(statistics.median(medians)) if medians else "–"
+        cells = [of_row[peer].in_brief() if peer in of_row else "" for peer in peers]
+        lines.append(f"| {CASES[case]}{f'; {variant}' if variant else ''} | {ours} | {' | '.join(cells)} |")
+    lines += ["", "What differs:", ""]
+    for peer in peers:
+        kinds: dict[str, list[str]] = {}  # note → kinds of work
+        for pair in pairs:
+            if pair.peer == peer and pair.theirs.note:
+                kinds.setdefault(pair.theirs.note, []).append(pair.case.rstrip("0123456789").rstrip("-"))
+        notes = [f"{', '.join(dict.fromkeys(cases))}: {note}" for note, cases in kinds.items()]
+        lines += [f"- {PEERS[peer]}. {'. '.join(notes)}."] if notes else []
+    return "\n".join(lines)
+
+
+def pairs_of(results: dict[str, Any]) -> list[Pair]:
+    """The pairs that were written as JSON."""
+    return [Pair(**{**pair, "ours": Side(**pair["ours"]), "theirs": Side(**pair["theirs"])}) for pair in results["pairs"]]
 
 
 def load_now() -> str:
@@ -260,13 +363,13 @@ def main() -> None:
             able[peer] = run(python_of(peer), ADAPTERS / f"adapter_{peer}.py", "--list").split()
         except Failed as failure:
             broken[peer] = str(failure)
-    for case in args.cases:
+    for group in GROUPS:
         for peer, cases in able.items():
-            if case in cases:
-                compared = compare(case, peer, repeats, blocks, block_seconds)
-                pairs += compared
-                for pair in compared:
-                    print(f"{time.perf_counter() - start:5.0f} s  {case}: {pair.line()}", file=sys.stderr, flush=True)
+            chosen = [case for case in group if case in cases and case in args.cases]
+            compared = compare(chosen, peer, repeats, blocks, block_seconds) if chosen else []
+            pairs += compared
+            for pair in compared:
+                print(f"{time.perf_counter() - start:5.0f} s  {pair.case}: {pair.line()}", file=sys.stderr, flush=True)
     facts = {
         "date": time.strftime("%Y-%m-%d"),
         "processor": cpu_model(),

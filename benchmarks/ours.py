@@ -9,9 +9,9 @@ As a script it is an adapter like those of the peers (see ``peers/protocol.py``)
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import pairwise
+from itertools import cycle, islice, pairwise
 from typing import Any
 
 import gymnasium as gym
@@ -25,15 +25,14 @@ from peers.protocol import (
     GAMMA,
     HIDDEN,
     LEARNING_RATE,
-    N_WORLDS,
     SPREAD_AGENTS,
     TAG_SHEEP,
     TAG_WOLVES,
     TAU,
-    TRAINING,
     TRAINING_AGENTS,
     UPDATES,
     Work,
+    cases,
     main,
 )
 from stable_baselines3.common.callbacks import BaseCallback
@@ -70,6 +69,8 @@ def learner(
     algorithm: type[MADDPG] = MADDPG,
     buffer_size: int = BUFFER_SIZE,
     n_envs: int = 1,
+    state_size: int = STATE_SIZE,
+    hidden: Sequence[int] = HIDDEN,
     **settings: Any,
 ) -> MADDPG:
     """
@@ -81,10 +82,12 @@ def learner(
     :param algorithm: MADDPG or one with another replay
     :param buffer_size: transitions held
     :param n_envs: worlds that fill the buffer
+    :param state_size: of the world's state
+    :param hidden: sizes of the hidden layers
     :param settings: of the algorithm
     """
     th.set_num_threads(1)
-    env = DummyVecEnv([partial(RandomWorld, n_agents, obs_size, action_size, STATE_SIZE)] * n_envs)
+    env = DummyVecEnv([partial(RandomWorld, n_agents, obs_size, action_size, state_size)] * n_envs)
     model = algorithm(
         "MlpPolicy",
         env,
@@ -93,34 +96,43 @@ def learner(
         batch_size=BATCH_SIZE,
         tau=TAU,
         gamma=GAMMA,
-        policy_kwargs={"net_arch": list(HIDDEN)},
+        policy_kwargs={"net_arch": list(hidden)},
         seed=0,
         device="cpu",
         **settings,
     )
     model.set_logger(configure(None, []))
-    rng = np.random.default_rng(0)
-    for _ in range(model.replay_buffer.buffer_size):
-        model.replay_buffer.add(*random_step(model, rng))
+    for step in islice(cycle(random_steps(model)), model.replay_buffer.buffer_size):
+        model.replay_buffer.add(*step)
     return model
 
 
-def random_step(model: MADDPG, rng: np.random.Generator) -> tuple[Any, ...]:
-    """What a buffer's ``add`` takes: one step of all worlds."""
-    layout, n_envs = model.layout, model.n_envs
-    observations, next_observations = rng.standard_normal((2, n_envs, sum(layout.obs_sizes)), dtype=np.float32)
-    actions = rng.random((n_envs, sum(layout.action_sizes)), dtype=np.float32)
-    infos = [
-        {
-            "agent_rewards": rng.standard_normal(layout.n_agents, dtype=np.float32),
-            "agent_terminated": np.zeros(layout.n_agents, dtype=bool),
-            "agent_alive": np.ones(layout.n_agents, dtype=bool),
-            "state": rng.standard_normal(layout.state_size, dtype=np.float32),
-            "next_state": rng.standard_normal(layout.state_size, dtype=np.float32),
-        }
-        for _ in range(n_envs)
-    ]
-    return observations, next_observations, actions, np.zeros(n_envs), np.zeros(n_envs, dtype=bool), infos
+def random_steps(model: MADDPG, n_steps: int = 10 * EPISODE_STEPS) -> list[tuple[Any, ...]]:
+    """
+    Steps of all worlds as a buffer's ``add`` takes them, one after the other: what one step ends with, the next begins with,
+    but where an episode reaches its time limit.
+    """
+    layout, n_envs, rng = model.layout, model.n_envs, np.random.default_rng(0)
+    observations = rng.standard_normal((n_steps + 1, n_envs, sum(layout.obs_sizes)), dtype=np.float32)
+    states = rng.standard_normal((n_steps + 1, n_envs, layout.state_size), dtype=np.float32)
+    steps = []
+    for t in range(n_steps):
+        ends = (t + 1) % EPISODE_STEPS == 0
+        last, last_states = (-observations[t], -states[t]) if ends else (observations[t + 1], states[t + 1])
+        infos = [
+            {
+                "agent_rewards": rng.standard_normal(layout.n_agents, dtype=np.float32),
+                "agent_terminated": np.zeros(layout.n_agents, dtype=bool),
+                "agent_alive": np.ones(layout.n_agents, dtype=bool),
+                "state": states[t, world],
+                "next_state": last_states[world],
+                "TimeLimit.truncated": ends,
+            }
+            for world in range(n_envs)
+        ]
+        actions = rng.random((n_envs, sum(layout.action_sizes)), dtype=np.float32)
+        steps.append((observations[t], last, actions, np.zeros(n_envs), np.full(n_envs, ends), infos))
+    return steps
 
 
 def update(n_agents: int, obs_size: int, action_size: int, critic_input: str = "observations") -> Work:
@@ -129,11 +141,17 @@ def update(n_agents: int, obs_size: int, action_size: int, critic_input: str = "
     return Work(lambda: model.train(1, BATCH_SIZE))
 
 
+def predict(n_agents: int, obs_size: int, action_size: int, n_rows: int) -> Work:
+    """``predict``: what all agents do, given joint observations."""
+    model = learner(n_agents, obs_size, action_size, buffer_size=BATCH_SIZE)
+    rows = np.random.default_rng(0).standard_normal((n_rows, n_agents * obs_size), dtype=np.float32)
+    return Work(lambda: model.predict(rows, deterministic=True), note="NumPy to NumPy")
+
+
 def simulate(worlds: ParticleWorlds) -> Work:
     """Steps of all worlds with random actions that were drawn before; worlds whose episode is over start anew."""
     rng = np.random.default_rng(0)
-    n_steps = 50
-    actions = rng.uniform(-1, 1, (n_steps, worlds.n_worlds, worlds.n_agents, 2))
+    actions = rng.uniform(-1, 1, (EPISODE_STEPS, worlds.n_worlds, worlds.n_agents, 2))
     worlds.seed(range(worlds.n_worlds))
     worlds.reset()
 
@@ -144,7 +162,7 @@ def simulate(worlds: ParticleWorlds) -> Work:
             if over.any():
                 worlds.reset(np.flatnonzero(over))
 
-    return Work(steps, n_steps * worlds.n_worlds)
+    return Work(steps, EPISODE_STEPS * worlds.n_worlds)
 
 
 def spread(n_worlds: int) -> Work:
@@ -164,23 +182,31 @@ def tag(n_worlds: int) -> Work:
     return work
 
 
-def per_sample() -> Work:
-    model = learner(*UPDATES["update-28"], PERMADDPG)
-    buffer, rng = model.replay_buffer, np.random.default_rng(0)
-    buffer.update_priorities(np.arange(BUFFER_SIZE), th.as_tensor(rng.random(BUFFER_SIZE)))
-    return Work(lambda: buffer.sample(BATCH_SIZE), note="by rank, returns tensors")
+def sample(algorithm: type[MADDPG], note: str) -> Work:
+    """Draw a minibatch from a full buffer of 28 agents."""
+    model = learner(*UPDATES["update-28"], algorithm)
+    model.replay_buffer.update_priorities(np.arange(BUFFER_SIZE), th.rand(BUFFER_SIZE, dtype=th.float64))
+    return Work(lambda: model.replay_buffer.sample(BATCH_SIZE), note=note)
 
 
-def per_priorities() -> Work:
+def add(algorithm: type[MADDPG]) -> Work:
+    """Store one joint transition of 28 agents."""
+    model = learner(*UPDATES["update-28"], algorithm)
+    steps = cycle(random_steps(model))
+    return Work(lambda: model.replay_buffer.add(*next(steps)), note="per-agent values from the infos of the env")
+
+
+def priorities() -> Work:
     model, rng = learner(*UPDATES["update-28"], PERMADDPG), np.random.default_rng(0)
     rows, errors = rng.integers(BUFFER_SIZE, size=BATCH_SIZE), th.as_tensor(rng.random(BATCH_SIZE))
     return Work(lambda: model.replay_buffer.update_priorities(rows, errors), note="by rank (ranked at the next draw)")
 
 
-def per_add() -> Work:
-    model = learner(*UPDATES["update-28"], PERMADDPG)
-    step = random_step(model, np.random.default_rng(0))
-    return Work(lambda: model.replay_buffer.add(*step), note="per-agent values from the infos of the env")
+def in_turn() -> Work:
+    """A draw, and the priorities of what was drawn."""
+    buffer, rng = learner(*UPDATES["update-28"], PERMADDPG).replay_buffer, np.random.default_rng(0)
+    errors = th.as_tensor(rng.random(BATCH_SIZE))
+    return Work(lambda: buffer.update_priorities(buffer.sample(BATCH_SIZE).rows, errors), note="by rank, returns tensors")
 
 
 def end_to_end(
@@ -246,15 +272,15 @@ def train(steps_per_update: int) -> Work:
 
 
 CASES: dict[str, Callable[[], Work]] = {
-    **{case: partial(update, *sizes) for case, sizes in UPDATES.items()},
+    **cases(update=update, predict=predict, spread=spread, tag=tag, train=train),
     "update-28-state": partial(update, *UPDATES["update-28"], "state"),
     "update-28-own_observation": partial(update, *UPDATES["update-28"], "own_observation"),
-    **{f"spread-{n}": partial(spread, n) for n in N_WORLDS},
-    **{f"tag-{n}": partial(tag, n) for n in N_WORLDS},
-    "per-sample": per_sample,
-    "per-priorities": per_priorities,
-    "per-add": per_add,
-    **{case: partial(train, steps) for case, steps in TRAINING.items()},
+    "uniform-sample": partial(sample, MADDPG, "returns tensors"),
+    "uniform-add": partial(add, MADDPG),
+    "per-sample": partial(sample, PERMADDPG, "by rank, returns tensors"),
+    "per-priorities": priorities,
+    "per-turn": in_turn,
+    "per-add": partial(add, PERMADDPG),
 }
 
 if __name__ == "__main__":

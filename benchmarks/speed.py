@@ -18,13 +18,13 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from functools import partial
-from itertools import pairwise
+from itertools import cycle, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch as th
-from ours import PACKAGES, STATE_SIZE, end_to_end, learner, random_step, simulate
+from ours import PACKAGES, STATE_SIZE, end_to_end, learner, random_steps, simulate
 from peers.protocol import (
     BATCH_SIZE,
     BUFFER_SIZE,
@@ -42,6 +42,7 @@ from sb3_kfcv.saving.files import atomic_write
 from sb3_kfcv.vec_env.make import WORLDS, make_worlds
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results" / "speed.json"
+COLUMNS = ["", "work", "median", "min–max", "per second", "floor (ratio)"]
 ALGORITHMS: dict[str, type[MADDPG]] = {"uniform": MADDPG, "by rank": PERMADDPG, "curriculum": KFCVMADDPG}
 NEVER: dict[str, Any] = {"replay_buffer_kwargs": {"refresh_every": 10**9, "refresh_fraction": 2.0, "first_teacher_steps": 1}}
 """No refresh but the first: what the curriculum costs between refreshes."""
@@ -196,17 +197,20 @@ def replay(effort: Effort) -> Iterator[Row]:
             buffer, rng = model.replay_buffer, np.random.default_rng(0)
             buffer.progress = 0.25  # the curriculum is at work
             buffer.update_priorities(np.arange(buffer.n_rows), th.as_tensor(rng.random(buffer.n_rows)))
-            step, by_rank = random_step(model, rng), algorithm is PERMADDPG
+            steps, by_rank = cycle(random_steps(model)), algorithm is PERMADDPG
             rows, errors = rng.integers(buffer.n_rows, size=BATCH_SIZE), th.as_tensor(rng.random(BATCH_SIZE))
 
-            def all_three(buffer: Any = buffer, step: Any = step, errors: th.Tensor = errors) -> None:
-                buffer.add(*step)
+            def add(buffer: Any = buffer, steps: Any = steps) -> None:
+                buffer.add(*next(steps))
+
+            def all_three(buffer: Any = buffer, steps: Any = steps, errors: th.Tensor = errors) -> None:
+                buffer.add(*next(steps))
                 buffer.update_priorities(buffer.sample(BATCH_SIZE).rows, errors)
 
             works: dict[str, Callable[[], object]] = {
                 f"sample {BATCH_SIZE}": partial(buffer.sample, BATCH_SIZE),
                 **({f"update {BATCH_SIZE} priorities": partial(buffer.update_priorities, rows, errors)} if by_rank else {}),
-                f"add a step of {n_envs} world{'s' if n_envs > 1 else ''}": partial(buffer.add, *step),
+                f"add a step of {n_envs} world{'s' if n_envs > 1 else ''}": add,
                 "add, sample, update priorities in turn": all_three,
             }
             for work, operation in works.items():
@@ -306,8 +310,7 @@ def main() -> None:
     print(f"{facts['processor']}, {facts['threads']} thread, {facts['date']}; ", end="")
     print(", ".join(f"{package} {number}" for package, number in facts["versions"].items()))
     print("\nBatch 128, networks 64-64 of each agent's own, medians of", effort.repeats, "blocks.\n")
-    header = ["", "work", "median", "min–max", "per second", "floor (ratio)"]
-    print("| " + " | ".join(header) + " |\n" + "|---" * len(header) + "|")
+    print("| " + " | ".join(COLUMNS) + " |\n" + "|---" * len(COLUMNS) + "|")
     start, rows = time.perf_counter(), []
     for group in args.groups:
         for row in GROUPS[group](effort):

@@ -3,6 +3,8 @@ AgileRL: ``MADDPG``, its ``ReplayBuffer`` and its trainer.
 
 - ``update``: the buffer is filled with ``MultiAgentTransition``; timed are ``ReplayBuffer.sample`` and ``MADDPG.learn``,
   as its trainer calls them.
+- ``predict``: ``MADDPG.get_action`` in evaluation mode (no noise).
+- ``uniform``: ``ReplayBuffer.sample`` and ``add``, the latter with a transition that was made before.
 - ``train``: ``train_multi_agent_off_policy`` in mpe2's ``simple_spread``, one world (its vectorised env needs a process per
   world), a call per block. Each call ends with one test episode, which is part of its loop, and is counted as time.
 
@@ -13,7 +15,6 @@ its critics are 64-64 and see the actions after the first layer.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,10 +25,10 @@ from protocol import (
     GAMMA,
     LEARNING_RATE,
     TAU,
-    TRAINING,
     TRAINING_AGENTS,
     UPDATES,
     Work,
+    cases,
     main,
 )
 
@@ -64,36 +65,71 @@ def learner(observation_spaces: list[Any], action_spaces: list[Any], names: list
     )
 
 
-def update(n_agents: int, obs_size: int, action_size: int) -> Work:
-    import torch
-    from agilerl.components.data import MultiAgentTransition, transition_to_tensordict
-    from agilerl.components.replay_buffer import ReplayBuffer
+def sized(n_agents: int, obs_size: int, action_size: int) -> Any:
+    """A learner of the wanted sizes."""
     from gymnasium.spaces import Box
 
-    names = [distinct(i) for i in range(n_agents)]
-    agents = learner(
+    return learner(
         [Box(-np.inf, np.inf, (obs_size,), np.float32)] * n_agents,
         [Box(-1.0, 1.0, (action_size,), np.float32)] * n_agents,
-        names,
+        [distinct(i) for i in range(n_agents)],
     )
-    rng = np.random.default_rng(0)
 
-    def per_agent(*shape: int) -> dict[str, np.ndarray]:
-        return {name: rng.random((BUFFER_SIZE, *shape), dtype=np.float32) for name in names}
+
+def per_agent(n_agents: int, *shape: int) -> dict[str, np.ndarray]:
+    """Agent → random numbers."""
+    rng = np.random.default_rng(0)
+    return {distinct(i): rng.random(shape, dtype=np.float32) for i in range(n_agents)}
+
+
+def transitions(n_rows: int, n_agents: int, obs_size: int, action_size: int) -> Any:
+    """Random transitions, as its trainer makes them of what an env gives."""
+    import torch
+    from agilerl.components.data import MultiAgentTransition, transition_to_tensordict
 
     rows = transition_to_tensordict(
         MultiAgentTransition(
-            obs=per_agent(obs_size),
-            action=per_agent(action_size),
-            reward=per_agent(),
-            next_obs=per_agent(obs_size),
-            done={name: np.zeros(BUFFER_SIZE, dtype=np.float32) for name in names},
+            obs=per_agent(n_agents, n_rows, obs_size),
+            action=per_agent(n_agents, n_rows, action_size),
+            reward=per_agent(n_agents, n_rows),
+            next_obs=per_agent(n_agents, n_rows, obs_size),
+            done={distinct(i): np.zeros(n_rows, dtype=np.float32) for i in range(n_agents)},
         )
     )
-    rows.batch_size = torch.Size([BUFFER_SIZE])
+    rows.batch_size = torch.Size([n_rows])
+    return rows
+
+
+def full_memory(*sizes: int) -> Any:
+    import torch
+    from agilerl.components.replay_buffer import ReplayBuffer
+
+    torch.set_num_threads(1)
     memory = ReplayBuffer(BUFFER_SIZE)
-    memory.add(rows)
+    memory.add(transitions(BUFFER_SIZE, *sizes))
+    return memory
+
+
+def update(*sizes: int) -> Work:
+    agents, memory = sized(*sizes), full_memory(*sizes)
     return Work(lambda: agents.learn(memory.sample(BATCH_SIZE)), note=NOTE)
+
+
+def predict(n_agents: int, obs_size: int, action_size: int, n_rows: int) -> Work:
+    agents, seen = sized(n_agents, obs_size, action_size), per_agent(n_agents, n_rows, obs_size)
+    agents.set_training_mode(False)
+    return Work(lambda: agents.get_action(seen), note="NumPy to NumPy; actors 64-64-64")
+
+
+def uniform_sample() -> Work:
+    memory = full_memory(*UPDATES["update-28"])
+    return Work(lambda: memory.sample(BATCH_SIZE), note="returns a tensordict with an entry per agent")
+
+
+def uniform_add() -> Work:
+    sizes = UPDATES["update-28"]
+    memory, row = full_memory(*sizes), transitions(1, *sizes)
+    return Work(lambda: memory.add(row), note="takes a tensordict with an entry per agent, made before")
 
 
 def renamed_spread() -> Any:
@@ -159,7 +195,8 @@ if __name__ == "__main__":
     main(
         ["agilerl", "torch", "tensordict", "mpe2", "pettingzoo", "numpy"],
         {
-            **{case: partial(update, *sizes) for case, sizes in UPDATES.items()},
-            **{case: partial(train, steps) for case, steps in TRAINING.items()},
+            **cases(update=update, predict=predict, train=train),
+            "uniform-sample": uniform_sample,
+            "uniform-add": uniform_add,
         },
     )

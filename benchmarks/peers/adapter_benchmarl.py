@@ -4,9 +4,12 @@ BenchMARL, and VMAS, the simulator of its authors that comes with it.
 - ``update``: an ``Experiment`` on a task of the wanted sizes, whose replay buffer is filled with random transitions;
   timed is ``Experiment._optimizer_loop``, the method that its own training loop calls for one update (there is no public
   one). Networks and critics per agent (``share_policy_params`` and ``share_param_critic`` off), evaluated by ``vmap``.
+- ``predict``: its policy for collection, without noise, on a tensordict of all agents' observations.
+- ``uniform``: the replay buffer of such an experiment (TorchRL's), by ``sample`` and, a transition at a time, ``extend``.
 - ``train``: ``Experiment.run`` on the VMAS task ``simple_spread``, as many worlds as env steps per update, so that every
   round of steps is followed by one update; timed between the callbacks of its iterations; evaluation off, CSV logger.
-- ``spread`` and ``tag``: VMAS alone by ``make_env`` and ``step``, all worlds reset when the episode is over.
+- ``spread`` and ``tag``: VMAS alone by ``make_env`` and ``step``, all worlds reset when the episode is over; with very many
+  worlds steps alone.
 """
 
 from __future__ import annotations
@@ -25,15 +28,14 @@ from protocol import (
     GAMMA,
     HIDDEN,
     LEARNING_RATE,
-    N_WORLDS,
     SPREAD_AGENTS,
     TAG_SHEEP,
     TAG_WOLVES,
     TAU,
-    TRAINING,
     TRAINING_AGENTS,
     UPDATES,
     Work,
+    cases,
     main,
 )
 
@@ -45,6 +47,9 @@ SCENARIOS: dict[str, tuple[str, dict[str, int], str]] = {
         "VMAS simple_tag, observations 84–86, continuous actions; no food, nobody dies",
     ),
 }
+
+MOST_AGENTS: dict[str, int] = {"spread": 2**16, "tag": 28 * 32}
+"""In all worlds, for a whole episode to be timed; with more, a step takes seconds, and steps alone are."""
 
 
 def experiment(task: Any, callbacks: list[Any] | None = None, **settings: Any) -> Any:
@@ -145,7 +150,8 @@ def random_task(*sizes: int) -> Any:
     return RandomTask("sizes", {})
 
 
-def update(n_agents: int, obs_size: int, action_size: int) -> Work:
+def learner_with_rows(n_agents: int, obs_size: int, action_size: int) -> tuple[Any, Any]:
+    """An experiment whose replay buffer is full, and the random transitions that it holds."""
     import torch
     from tensordict import TensorDict
 
@@ -163,8 +169,42 @@ def update(n_agents: int, obs_size: int, action_size: int) -> Work:
         batch_size=[BUFFER_SIZE],
     )
     rows["agents"].batch_size = rows["next", "agents"].batch_size = shape
-    learner.replay_buffers["agents"].extend(learner.algorithm.process_batch("agents", rows))
+    rows = learner.algorithm.process_batch("agents", rows)
+    learner.replay_buffers["agents"].extend(rows)
+    return learner, rows
+
+
+def update(n_agents: int, obs_size: int, action_size: int) -> Work:
+    learner, _ = learner_with_rows(n_agents, obs_size, action_size)
     return Work(lambda: learner._optimizer_loop("agents"), note="no target actors")
+
+
+def predict(n_agents: int, obs_size: int, action_size: int, n_rows: int) -> Work:
+    import torch
+    from tensordict import TensorDict
+    from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+    learner = experiment(random_task(n_agents, obs_size, action_size))
+    seen = torch.randn(n_rows, n_agents, obs_size)
+
+    def act() -> None:
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            agents = TensorDict({"observation": seen}, batch_size=[n_rows, n_agents])
+            learner.policy(TensorDict({"agents": agents}, batch_size=[n_rows]))
+
+    return Work(act, note="tensors to tensors")
+
+
+def uniform_sample() -> Work:
+    learner, _ = learner_with_rows(*UPDATES["update-28"])
+    buffer = learner.replay_buffers["agents"]
+    return Work(buffer.sample, note="TorchRL's buffer, returns a tensordict; rewards and ends per agent and per world")
+
+
+def uniform_add() -> Work:
+    learner, rows = learner_with_rows(*UPDATES["update-28"])
+    buffer, row = learner.replay_buffers["agents"], rows[:1]
+    return Work(lambda: buffer.extend(row), note="TorchRL's buffer, takes a tensordict; it adds a batch at a time in training")
 
 
 def train(steps_per_update: int) -> Work:
@@ -207,21 +247,25 @@ def simulate(scenario: str, n_worlds: int) -> Work:
     name, settings, note = SCENARIOS[scenario]
     env = vmas.make_env(name, num_envs=n_worlds, device="cpu", continuous_actions=True, seed=0, **settings)
     actions = [2 * torch.rand(EPISODE_STEPS, n_worlds, env.get_agent_action_size(agent)) - 1 for agent in env.agents]
+    if n_worlds * len(env.agents) <= MOST_AGENTS[scenario]:
 
-    def episode() -> None:
-        for t in range(EPISODE_STEPS):
-            env.step([chosen[t] for chosen in actions])
-        env.reset()
+        def episode() -> None:
+            for t in range(EPISODE_STEPS):
+                env.step([chosen[t] for chosen in actions])
+            env.reset()
 
-    return Work(episode, EPISODE_STEPS * n_worlds, note)
+        return Work(episode, EPISODE_STEPS * n_worlds, note)
+    first = [chosen[0] for chosen in actions]
+    return Work(lambda: env.step(first), n_worlds, f"{note}; steps alone, without resets")
 
 
 if __name__ == "__main__":
     main(
         ["benchmarl", "torchrl", "tensordict", "vmas", "torch", "numpy"],
         {
-            **{case: partial(update, *sizes) for case, sizes in UPDATES.items()},
-            **{f"{scenario}-{n}": partial(simulate, scenario, n) for scenario in SCENARIOS for n in N_WORLDS},
-            **{case: partial(train, steps) for case, steps in TRAINING.items()},
+            **cases(update=update, predict=predict, train=train),
+            **cases(spread=partial(simulate, "spread"), tag=partial(simulate, "tag")),
+            "uniform-sample": uniform_sample,
+            "uniform-add": uniform_add,
         },
     )

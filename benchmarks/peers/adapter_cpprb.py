@@ -1,6 +1,6 @@
 """
-cpprb: ``PrioritizedReplayBuffer``, driven as its documentation shows. It stores joint transitions of 28 agents; priorities
-are proportional to the errors (a segment tree), where ours are by their rank.
+cpprb: ``ReplayBuffer`` and ``PrioritizedReplayBuffer``, driven as its documentation shows. They store joint transitions of
+28 agents; priorities are proportional to the errors (a segment tree), where ours are by their rank.
 """
 
 from __future__ import annotations
@@ -38,6 +38,29 @@ def filled() -> tuple[Any, np.random.Generator]:
     return buffer, rng
 
 
+def uniform() -> tuple[Any, np.random.Generator]:
+    """A full buffer without priorities."""
+    from cpprb import ReplayBuffer
+
+    rng = np.random.default_rng(0)
+    shapes = {name: {"shape": value.shape, "dtype": value.dtype} for name, value in transition(rng).items()}
+    buffer = ReplayBuffer(BUFFER_SIZE, shapes)
+    for _ in range(BUFFER_SIZE):
+        buffer.add(**transition(rng))
+    return buffer, rng
+
+
+def uniform_sample() -> Work:
+    buffer, _ = uniform()
+    return Work(lambda: buffer.sample(BATCH_SIZE), note="returns NumPy arrays")
+
+
+def uniform_add() -> Work:
+    buffer, rng = uniform()
+    row = transition(rng)
+    return Work(lambda: buffer.add(**row), note="every value stored as given")
+
+
 def sample() -> Work:
     buffer, _ = filled()
     return Work(lambda: buffer.sample(BATCH_SIZE, beta=0.5), note=NOTE)
@@ -49,6 +72,12 @@ def priorities() -> Work:
     return Work(lambda: buffer.update_priorities(rows, errors), note=NOTE)
 
 
+def in_turn() -> Work:
+    buffer, rng = filled()
+    errors = rng.random(BATCH_SIZE)
+    return Work(lambda: buffer.update_priorities(buffer.sample(BATCH_SIZE, beta=0.5)["indexes"], errors), note=NOTE)
+
+
 def add() -> Work:
     buffer, rng = filled()
     row = transition(rng)
@@ -56,4 +85,14 @@ def add() -> Work:
 
 
 if __name__ == "__main__":
-    main(["cpprb", "numpy"], {"per-sample": sample, "per-priorities": priorities, "per-add": add})
+    main(
+        ["cpprb", "numpy"],
+        {
+            "uniform-sample": uniform_sample,
+            "uniform-add": uniform_add,
+            "per-sample": sample,
+            "per-priorities": priorities,
+            "per-turn": in_turn,
+            "per-add": add,
+        },
+    )

@@ -3,6 +3,8 @@ XuanCe: ``MADDPG_Agents`` with networks per agent (``use_parameter_sharing`` off
 
 - ``update``: built without envs from the spaces, its memory filled by ``store``; timed is ``train_epochs(1)``, which draws
   a minibatch and updates all agents.
+- ``predict``: ``get_actions`` in test mode (no noise), on a list with a dict per joint observation.
+- ``uniform``: ``store`` and ``sample`` of such a memory.
 - ``train``: ``agents.train`` in PettingZoo's ``simple_spread`` (its vec env in one process, as many worlds as env steps per
   update, so that every round of steps is followed by one update). TensorBoard is its only logger without an account, and
   stays on.
@@ -13,7 +15,6 @@ XuanCe: ``MADDPG_Agents`` with networks per agent (``use_parameter_sharing`` off
 from __future__ import annotations
 
 import tempfile
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,9 +26,9 @@ from protocol import (
     HIDDEN,
     LEARNING_RATE,
     TAU,
-    TRAINING,
     UPDATES,
     Work,
+    cases,
     main,
 )
 
@@ -51,33 +52,66 @@ def settings(n_envs: int) -> Any:
     return config
 
 
-def update(n_agents: int, obs_size: int, action_size: int) -> Work:
+def sized(n_agents: int, obs_size: int, action_size: int) -> Any:
+    """A learner of the wanted sizes."""
     from gymnasium.spaces import Box
     from xuance.torch.agents import MADDPG_Agents
 
     names = [f"agent_{i}" for i in range(n_agents)]
-    agents = MADDPG_Agents(
+    return MADDPG_Agents(
         settings(n_envs=1),
         num_agents=n_agents,
         agent_keys=names,
         observation_space={name: Box(-np.inf, np.inf, (obs_size,), np.float32) for name in names},
         action_space={name: Box(0.0, 1.0, (action_size,), np.float32) for name in names},
     )
-    rng = np.random.default_rng(0)
+
+
+def step(rng: np.random.Generator, n_agents: int, obs_size: int, action_size: int) -> dict[str, dict[str, np.ndarray]]:
+    """A random transition of one world, as ``store`` takes it."""
+    names = [f"agent_{i}" for i in range(n_agents)]
 
     def per_agent(*shape: int) -> dict[str, np.ndarray]:
         return {name: rng.random((1, *shape), dtype=np.float32) for name in names}
 
+    return {
+        "obs": per_agent(obs_size),
+        "actions": per_agent(action_size),
+        "obs_next": per_agent(obs_size),
+        "rewards": per_agent(),
+        "terminals": {name: np.zeros(1, dtype=bool) for name in names},
+        "agent_mask": {name: np.ones(1, dtype=bool) for name in names},
+    }
+
+
+def full(*sizes: int) -> Any:
+    """A learner whose memory is full."""
+    agents, rng = sized(*sizes), np.random.default_rng(0)
     for _ in range(BUFFER_SIZE):
-        agents.memory.store(
-            obs=per_agent(obs_size),
-            actions=per_agent(action_size),
-            obs_next=per_agent(obs_size),
-            rewards=per_agent(),
-            terminals={name: np.zeros(1, dtype=bool) for name in names},
-            agent_mask={name: np.ones(1, dtype=bool) for name in names},
-        )
+        agents.memory.store(**step(rng, *sizes))
+    return agents
+
+
+def update(*sizes: int) -> Work:
+    agents = full(*sizes)
     return Work(lambda: agents.train_epochs(1), note="learning rates scheduled at each update")
+
+
+def predict(n_agents: int, obs_size: int, action_size: int, n_rows: int) -> Work:
+    agents, rng = sized(n_agents, obs_size, action_size), np.random.default_rng(0)
+    seen = [{name: rng.random(obs_size, dtype=np.float32) for name in agents.agent_keys} for _ in range(n_rows)]
+    return Work(lambda: agents.get_actions(obs_dict=seen, test_mode=True), note="NumPy to NumPy, a dict per joint observation")
+
+
+def uniform_sample() -> Work:
+    agents = full(*UPDATES["update-28"])
+    return Work(agents.memory.sample, note="returns NumPy arrays per agent")
+
+
+def uniform_add() -> Work:
+    sizes = UPDATES["update-28"]
+    agents, row = full(*sizes), step(np.random.default_rng(0), *sizes)
+    return Work(lambda: agents.memory.store(**row), note="takes NumPy arrays per agent")
 
 
 def train(steps_per_update: int) -> Work:
@@ -100,7 +134,8 @@ if __name__ == "__main__":
     main(
         ["xuance", "torch", "pettingzoo", "numpy"],
         {
-            **{case: partial(update, *sizes) for case, sizes in UPDATES.items()},
-            **{case: partial(train, steps) for case, steps in TRAINING.items()},
+            **cases(update=update, predict=predict, train=train),
+            "uniform-sample": uniform_sample,
+            "uniform-add": uniform_add,
         },
     )
