@@ -67,6 +67,8 @@ KINDS = {
     "gelu": {"activation_fn": nn.GELU},
     "parameters in the activation": {"activation_fn": Leaky},
     "shared": {"members": [0, 3, 1, 0, 2, 4, 5, 0]},
+    "shared by equal runs": {"members": [i // 2 for i in range(12)]},
+    "shared by equal runs, tanh": {"members": [i // 2 for i in range(12)], "activation_fn": nn.Tanh},
     "shared, tanh": {"members": [0, 0, 1, 2, 3, 4, 5, 0], "activation_fn": nn.Tanh},
 }
 

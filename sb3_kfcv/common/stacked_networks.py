@@ -118,6 +118,10 @@ class StackedMLP(nn.Module):
         self._evaluations: dict[int, Evaluation] = {}  # by batch size
         self._lender: tuple[StackedMLP, ...] = ()
         self.register_buffer("members", None if members is None else th.tensor(list(members)), persistent=False)
+        # Where as many consecutive members share each network, their rows are one longer minibatch of the network.
+        per_network, rest = divmod(self.n_members, n_networks)
+        runs = [i for i in range(n_networks) for _ in range(per_network)]
+        self.folds = members is not None and list(members) == runs and rest == 0 and not common_input
         wide_rows = None
         if members is not None:
             bound = 1 / math.sqrt(sizes[0] + len(members))
@@ -289,7 +293,10 @@ class Evaluation:
     def __init__(self, stack: StackedMLP, batch: int, lender: Evaluation | None = None) -> None:
         self.stack, self.batch = stack, batch
         self.relu = isinstance(stack.activation, nn.ReLU)
-        self.members, self.wide_rows, self.width = stack.members, stack.wide_rows, stack.sizes[1]
+        self.members, self.wide_rows, self.width = None if stack.folds else stack.members, stack.wide_rows, stack.sizes[1]
+        self.shape = (stack.n_members, batch)
+        if stack.folds:
+            self.shape = (stack.n_networks, stack.n_members // stack.n_networks * batch)
         self.parameters: list[tuple[nn.Parameter, nn.Parameter]] = [(layer.weight, layer.bias) for layer in stack.rest]  # type: ignore[misc]
         self.weights = [(weight.detach(), bias.detach()) for weight, bias in self.parameters]
         self.first, self.first_bias = stack.first.weight.detach(), stack.first.bias.detach()
@@ -299,18 +306,18 @@ class Evaluation:
         sizes = stack.sizes[1:]
         if lender is None:
             self.wide, first = self._first_layer()
-            self.layers = [first, *(self.first.new_empty(stack.n_members, batch, size) for size in sizes[1:])]
+            self.layers = [first, *(self.first.new_empty(*self.shape, size) for size in sizes[1:])]
             self.wide_gradient, first = self._first_layer()
-            self.gradients = [first, *(self.first.new_empty(stack.n_members, batch, size) for size in sizes[1:-1])]
+            self.gradients = [first, *(self.first.new_empty(*self.shape, size) for size in sizes[1:-1])]
         else:
             self.wide, self.layers = lender.wide, lender.layers
             self.wide_gradient, self.gradients = lender.wide_gradient, lender.gradients
 
     def _first_layer(self) -> tuple[th.Tensor, th.Tensor]:
-        """For the first layer, and viewed as (members, batch, hidden); with a common input its members stand side by side."""
+        """For the first layer, and viewed as those of the others; with a common input its members stand side by side."""
         stack = self.stack
         if not stack.common_input:
-            z = self.first.new_empty(stack.n_members, self.batch, self.width)
+            z = self.first.new_empty(*self.shape, self.width)
             return z, z
         wide = self.first.new_empty(self.batch, stack.n_members * self.width)
         return wide, stack.spread(wide)
@@ -324,15 +331,16 @@ class Evaluation:
         :param x: as for :meth:`StackedMLP.forward`
         :return: (members, batch, hidden), pre-activations of the first layer, which may be changed before :meth:`rest`
         """
-        self.x = x
+        self.x = x = self._folded(x)
         if self.stack.common_input:
             weight, bias = self.stack.side_by_side(self.first, self.first_bias)
             th.addmm(bias, x[0], weight, out=self.wide)
         else:
             self._layer(x, self.first, self.first_bias, self.wide)
+        z = self._unfolded(self.layers[0])
         if self.member_bias is not None:
-            self.layers[0].add_(self.member_bias)
-        return self.layers[0]
+            z.add_(self.member_bias)
+        return z
 
     def rest(self) -> th.Tensor:
         """
@@ -343,7 +351,7 @@ class Evaluation:
         self.graphs.clear()
         for z, (weight, bias), out in zip(self.layers, self.weights, self.layers[1:], strict=False):
             self._layer(self._activate(z), weight, bias, out)
-        return self.layers[-1]
+        return self._unfolded(self.layers[-1])
 
     def backward(self, gradient: th.Tensor, parameters: bool = True) -> th.Tensor:
         """
@@ -353,6 +361,7 @@ class Evaluation:
         :param parameters: write the gradients of the parameters into their ``grad``
         :return: the gradient at the pre-activations of the first layer (members, batch, hidden)
         """
+        gradient = self._folded(gradient)
         if not self.weights:
             self.gradients[0].copy_(gradient)
         for i in reversed(range(len(self.weights))):
@@ -364,7 +373,14 @@ class Evaluation:
             self._through_activation(i, gradient, parameters)
         if parameters:
             self._write_first_gradients()
-        return self.gradients[0]
+        return self._unfolded(self.gradients[0])
+
+    def _folded(self, values: th.Tensor) -> th.Tensor:
+        """(members, batch, …) → (networks, rows, …)."""
+        return values.reshape(*self.shape, values.shape[2]) if self.stack.folds else values
+
+    def _unfolded(self, values: th.Tensor) -> th.Tensor:
+        return values.view(self.stack.n_members, self.batch, values.shape[2]) if self.stack.folds else values
 
     def _layer(self, x: th.Tensor, weight: th.Tensor, bias: th.Tensor, out: th.Tensor) -> None:
         if self.members is not None:
@@ -393,7 +409,7 @@ class Evaluation:
             gradient_of(weight).zero_().view(-1, self.width).index_add_(0, self.wide_rows, wide)
             gradient_of(bias).zero_().view(-1, self.width).index_add_(0, stack.members, gradient.sum(1))  # type: ignore[arg-type]
         if stack.member_bias is not None:
-            th.sum(gradient, dim=1, keepdim=True, out=gradient_of(stack.member_bias))
+            th.sum(self._unfolded(gradient), dim=1, keepdim=True, out=gradient_of(stack.member_bias))
 
     def _activate(self, z: th.Tensor) -> th.Tensor:
         if self.relu:
