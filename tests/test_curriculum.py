@@ -1,14 +1,27 @@
 """Curriculum replay: folds, teachers (eq. 9), difficulty (eq. 10–11), buckets and stages (eq. 12)."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from scipy.stats import spearmanr
 
 from sb3_kfcv import KFCVReplayBuffer
-from sb3_kfcv.curriculum.difficulty import buckets_by_difficulty, combine_agents, cross_validated_errors
+from sb3_kfcv.curriculum.difficulty import (
+    UNSCORED,
+    buckets_by_difficulty,
+    combine_agents,
+    cross_validated_errors,
+    mean_of_the_living,
+    rank_correlation,
+    rows_to_score,
+    stratum_weights,
+)
 from sb3_kfcv.curriculum.folds import assign_folds, rows_per_fold
-from sb3_kfcv.curriculum.stages import bucket_shares, stage_at, uniform_share
+from sb3_kfcv.curriculum.stages import BucketMembers, bucket_shares, stage_at, uniform_share
+from sb3_kfcv.curriculum.teachers import Teachers
 
 OBS, ACT = spaces.Box(-np.inf, np.inf, (3,), np.float32), spaces.Box(-1, 1, (1,), np.float32)
 
@@ -112,18 +125,34 @@ def test_folds_are_permanent(n_envs):
 
 
 def spy_on_teachers(buffer):
-    """What each teacher is trained on: fold → set of serial numbers, filled as the buffer refreshes."""
+    """What each teacher may be trained on: fold → set of serial numbers, filled as the buffer refreshes."""
     fed = [set() for _ in range(buffer.n_folds)]
-    values = buffer.teachers.values
+    fit = buffer.teachers.fit
 
-    def spied(inputs):
-        if len(inputs) == buffer.n_folds:  # training: one minibatch each; the same rows for all are scored
-            for seen, own in zip(fed, inputs, strict=True):
-                seen.update(serials(own).tolist())
-        return values(inputs)
+    def spied(inputs, targets, live, members, *others):
+        for seen, own in zip(fed, members, strict=True):
+            seen.update(serials(inputs[own]).tolist())
+        return fit(inputs, targets, live, members, *others)
 
-    buffer.teachers.values = spied
+    buffer.teachers.fit = spied
     return fed
+
+
+def test_a_teacher_learns_from_its_own_rows_alone():
+    """Other inputs and targets in the rows of fold 1 leave teachers 0 and 2 what they are, to the bit."""
+
+    def fitted(disturbed):
+        th.manual_seed(0)
+        teachers = Teachers(3, 2, 4, [8], 0.01, "cpu")
+        inputs, targets = th.randn(30, 4), th.randn(2, 30)
+        inputs[disturbed], targets[:, disturbed] = 7.0, -7.0
+        members = [np.arange(fold, 30, 3) for fold in range(3)]
+        teachers.fit(inputs, targets, th.ones(2, 30), members, 20, 8, np.random.default_rng(0))
+        return teachers.values(th.ones(1, 1, 4))
+
+    before, after = fitted([]), fitted(list(range(1, 30, 3)))
+    assert th.equal(before[[0, 2]], after[[0, 2]])
+    assert not th.isclose(before[1], after[1]).any()
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
@@ -245,6 +274,12 @@ def test_the_buffer_scores_each_transition_by_the_teachers_that_have_not_seen_it
     np.testing.assert_allclose(buffer.scores, expected, rtol=1e-3)
 
 
+def test_dead_agents_weigh_nothing_however_large_their_errors_are():
+    """Agent 1 never lived: its mean is 0, and 3e38 over nearly nothing is infinite."""
+    scores = combine_agents(th.tensor([[1.0, 3.0], [3e38, 3e38]]), th.tensor([[1.0, 1], [0, 0]]))
+    assert scores.tolist() == [0.5, 1.5]
+
+
 def test_student_scores_are_the_learners_own_squared_errors():
     """Q is 0, so δ² is the squared reward; over its mean."""
     buffer = make_buffer(score="student")
@@ -268,6 +303,68 @@ def test_buckets_are_equal_to_within_one(n):
 
 def test_equal_scores_still_fill_equal_buckets():
     assert np.bincount(buckets_by_difficulty(np.ones(30), 5)).tolist() == [6] * 5
+
+
+def slow_buckets(scores, n_buckets):
+    """By ranks; of equal scores the first rank first."""
+    by_rank = sorted(range(len(scores)), key=lambda j: (scores[j], j))
+    return [by_rank.index(j) * n_buckets // len(scores) for j in range(len(scores))]
+
+
+@pytest.mark.parametrize("n_values", [1, 2, 5, 1000])
+@pytest.mark.parametrize("n", [1, 4, 5, 37, 100])
+def test_buckets_are_those_of_the_ranks(n, n_values):
+    """Also where many scores are equal, and where there are fewer transitions than buckets."""
+    scores = np.random.default_rng(n).integers(n_values, size=n).astype(float)
+    for n_buckets in (2, 5, 8):
+        assert buckets_by_difficulty(scores, n_buckets).tolist() == slow_buckets(scores.tolist(), n_buckets)
+
+
+@pytest.mark.parametrize("n_values", [3, 1000])
+def test_rank_correlation_is_spearmans(n_values):
+    rng = np.random.default_rng(0)
+    first = rng.integers(n_values, size=50).astype(float)
+    second = first + rng.integers(n_values, size=50)
+    assert rank_correlation(first, second) == pytest.approx(spearmanr(first, second).statistic)
+
+
+def test_nothing_correlates_with_a_constant():
+    assert rank_correlation(np.ones(5), np.arange(5.0)) == 0
+
+
+# ---- the transitions of a refresh
+
+
+@pytest.mark.parametrize(
+    ("at_most", "rows"),
+    [
+        (1, [3]),  # row 4 is the oldest, row 3 the newest, and 1, 3, 6 have no score: newest first 3, 1, 6
+        (2, [1, 3]),
+        (3, [1, 3, 6]),
+        (4, [1, 3, 5, 6]),  # 5 has the oldest score
+        (5, [0, 1, 3, 5, 6]),  # 0 and 4 come next: of equally old ones the first
+        (6, [0, 1, 3, 4, 5, 6]),
+        (7, [0, 1, 2, 3, 4, 5, 6]),
+        (99, [0, 1, 2, 3, 4, 5, 6]),
+    ],
+)
+def test_first_what_has_no_score_then_what_has_the_oldest(at_most, rows):
+    scored = np.array([True, False, True, False, True, True, False])
+    ages = np.array([20, 99, 10, 99, 20, 30, 99])
+    assert rows_to_score(scored, ages, 4, at_most).tolist() == rows
+
+
+def test_strata_stand_for_themselves():
+    """Of 10 transitions 6 had a score, of which 2 are scored again: each counts 3. Of the 4 others 1: it counts 4."""
+    scored = np.array([True] * 6 + [False] * 4)
+    assert stratum_weights(scored, np.array([0, 3, 9])).tolist() == [3, 3, 4]
+    assert stratum_weights(scored, np.arange(10)).tolist() == [1] * 10
+
+
+def test_a_weighted_mean_is_over_the_living():
+    """(3 · 2 + 1 · 5) / (3 + 1); agent 1 lived in the last alone."""
+    values, live = th.tensor([[2.0, 9, 5], [1, 1, 8]]), th.tensor([[1.0, 0, 1], [0, 0, 1]])
+    assert mean_of_the_living(values, live, th.tensor([3.0, 3, 1])).tolist() == [[11 / 4], [8]]
 
 
 # ---- stages
@@ -363,6 +460,41 @@ def test_draws_within_a_bucket_are_uniform():
     assert counts.max() < 100 + 50  # five standard deviations around 20,000 / 200
 
 
+@pytest.mark.parametrize("first_row", [0, 7, 19])
+@pytest.mark.parametrize("step", [1, 4])
+def test_members_are_what_a_search_of_the_whole_buffer_finds(first_row, step):
+    """While the rows are overwritten from ``first_row`` on, once round and beyond; every third has no bucket at first."""
+    buckets = np.random.default_rng(0).integers(3, size=20)
+    buckets[::3] = UNSCORED
+    members, left = BucketMembers(buckets, 3, first_row), buckets.copy()
+    for n_written in range(0, 45, step):
+        left[(first_row + np.arange(n_written)) % 20] = UNSCORED
+        members.forget((first_row + n_written) % 20, n_written)
+        for bucket in range(3):
+            expected = np.flatnonzero(left == bucket)
+            assert members.sizes[bucket] == len(expected)
+            places = np.arange(len(expected))
+            assert members.rows(np.full_like(places, bucket), places).tolist() == expected.tolist()
+
+
+def test_draws_after_overwriting_are_uniform_over_what_is_left():
+    """
+    Rows 0 … 249 of 600 are overwritten, and each bucket has lost some. Stage 3, λ = 0: a third of the draws from
+    what is left of each.
+    """
+    buffer = scored_buffer(PROGRESS[3])
+    buckets = true_buckets(buffer)
+    buckets[:250] = UNSCORED
+    add(buffer, 250)
+    counts = np.bincount(buffer.sample(60_000).rows, minlength=N)
+    assert counts[:250].sum() == 0
+    for bucket in range(3):
+        left = counts[buckets == bucket]
+        expected = 20_000 / len(left)
+        assert left.sum() == 20_000
+        assert np.abs(left - expected).max() < 5 * expected**0.5
+
+
 def test_random_buckets_know_nothing_of_difficulty():
     buffer = scored_buffer(stage_rule="random")
     drawn = np.unique(buffer.sample(20_000).rows)
@@ -451,9 +583,9 @@ def test_a_quarter_of_new_transitions_refreshes_sooner(n_new, updates):
     assert updates_until_refresh(buffer) == updates
 
 
-def test_refreshes_keep_to_their_budget_of_scored_transitions():
-    """60 transitions at 6 per update: not before 10 updates, though all are new and a refresh is wanted at each update."""
-    buffer = make_buffer(size=60, refresh_every=1, scored_per_update=6)
+def test_a_sooner_refresh_waits_until_all_can_be_scored():
+    """60 transitions at 6 per update: not before 10 updates, though all are new."""
+    buffer = make_buffer(size=60, refresh_every=40, scored_per_update=6)
     updates_until_refresh(buffer)
     add(buffer, 60)
     assert updates_until_refresh(buffer) == 10
@@ -469,21 +601,149 @@ def test_a_refresh_scores_what_is_new():
 
 
 def test_the_first_refresh_takes_more_steps():
-    """Each teacher sees one minibatch of 8 per step: 7 steps, then 3, then 3."""
     buffer = make_buffer(refresh_every=1, first_teacher_steps=7, teacher_steps=3)
-    trained = []
-    values = buffer.teachers.values
-
-    def counted(inputs):
-        trained.append(inputs.shape[1] if len(inputs) == buffer.n_folds else 0)
-        return values(inputs)
-
-    buffer.teachers.values = counted
-    totals = []
+    steps = []
+    buffer.teachers.fit = lambda inputs, targets, live, members, n_steps, *others: steps.append(n_steps) or 0.0
     for _ in range(3):
         buffer.sample(4)
-        totals.append(sum(trained))
-    assert totals == [7 * 8, 10 * 8, 13 * 8]
+    assert steps == [7, 3, 3]
+
+
+def incremental(**kwargs):
+    """200 transitions, of which a refresh after 4 updates may score 40; what each refresh worked on: serial numbers."""
+    kwargs = {"size": 200, "refresh_every": 4, "scored_per_update": 10, **kwargs}
+    buffer = make_buffer(**kwargs)
+    worked_on = []
+    read = buffer._read
+
+    def spied(rows):
+        found = read(rows)
+        worked_on.append(set(serials(found[0]).tolist()))
+        return found
+
+    buffer._read = spied
+    return buffer, worked_on
+
+
+def test_refreshes_keep_to_their_budget():
+    """The first as if it were not sooner; then 4 updates at 10 each. Every 4 updates, however large the buffer is."""
+    buffer, worked_on = incremental()
+    assert [updates_until_refresh(buffer) for _ in range(4)] == [1, 4, 4, 4]
+    assert [len(work) for work in worked_on] == [40, 40, 40, 40]
+
+
+def test_a_refresh_on_demand_works_on_all():
+    buffer, worked_on = incremental()
+    buffer.refresh()
+    assert worked_on == [set(range(200))]
+
+
+def test_nothing_is_scored_twice_before_all_have_been_scored():
+    """200 at 40 each: five refreshes without a repetition, the newest first; then from the oldest scores on."""
+    buffer, worked_on = incremental()
+    for _ in range(10):
+        updates_until_refresh(buffer)
+    by_newest = [set(range(160 - 40 * i, 200 - 40 * i)) for i in range(5)]
+    assert worked_on == by_newest * 2
+
+
+def test_new_transitions_are_scored_before_old_ones_are_scored_again():
+    """15 new ones before each refresh: with them 25 of those whose scores are the oldest."""
+    buffer, worked_on = incremental()
+    for _ in range(5):
+        updates_until_refresh(buffer)
+    ever = set.union(*worked_on)
+    for refresh in range(8):
+        add(buffer, 15)
+        updates_until_refresh(buffer)
+        new = set(range(200 + 15 * refresh, 215 + 15 * refresh))
+        assert worked_on[-1] - ever == new
+        assert len(worked_on[-1]) == 40
+        ever |= new
+    assert buffer.diagnostics()["curriculum/unscored"] == 0
+
+
+def test_no_teacher_ever_scores_what_it_was_trained_on():
+    """
+    Over refreshes of parts of a buffer that is overwritten more than twice: each new score is that of a loop over the teachers
+    that were never fed the transition, and what is not worked on keeps its score. Both strata stand for their part of the
+    buffer in the means: of the targets, of their squares, of the errors.
+    """
+    buffer, worked_on = incremental(n_agents=2)
+    fed = spy_on_teachers(buffer)
+    for _ in range(30):
+        add(buffer, 15)
+        had_score, before = buffer.buckets != UNSCORED, buffer.scores.copy()
+        updates_until_refresh(buffer)
+        rows = [j for j in range(200) if int(serials(th.as_tensor(buffer.observations[j, 0]))) in worked_on[-1]]
+        n_again = had_score[rows].sum()
+        weights = np.where(had_score[rows], had_score.sum() / max(n_again, 1), (~had_score).sum() / max(40 - n_again, 1))
+        y = buffer.rewards[rows, 0].T.astype(float)  # (agents, 40)
+        y = y - np.average(y, axis=1, weights=weights)[:, None]
+        y = y / np.sqrt(np.average(y**2, axis=1, weights=weights))[:, None]
+        errors = np.zeros((2, 40))
+        for place, j in enumerate(rows):
+            seen = th.as_tensor(buffer.observations[j])
+            with th.no_grad():
+                values = buffer.teachers.values(seen.unsqueeze(0))[:, :, 0].numpy()  # (folds, agents)
+            strangers = [fold for fold in range(3) if int(serials(seen)[0]) not in fed[fold]]
+            assert len(strangers) == 2
+            errors[:, place] = ((y[:, place] - values[strangers]) ** 2).sum(0)
+        expected = before.copy()
+        expected[rows] = (errors / np.average(errors, axis=1, weights=weights)[:, None]).mean(0)
+        np.testing.assert_allclose(buffer.scores, expected, rtol=2e-3, atol=1e-5)
+    assert sum(len(seen) for seen in fed) == len(set.union(*fed)) > 400
+
+
+def test_all_that_have_a_score_are_ranked_together():
+    """Half of the buffer after the first 100 of 200: buckets of 33 or 34, by scores of three refreshes."""
+    buffer, _ = incremental()
+    for _ in range(3):
+        updates_until_refresh(buffer)
+    scored = buffer.buckets != UNSCORED
+    assert scored.sum() == 120
+    assert buffer.buckets[scored].tolist() == slow_buckets(buffer.scores[scored].tolist(), 3)
+
+
+def test_new_transitions_may_be_harder_than_those_scored_before():
+    """
+    Scores by δ² = r². New rewards are five times the others', and the others have scores already: in the unit of the whole
+    buffer, of which the new are a tenth, and not of the transitions worked on, of which they are half.
+    """
+    buffer, _ = incremental(score="student")
+    for _ in range(5):
+        updates_until_refresh(buffer)
+    buffer.rewards[:] = np.sign(buffer.rewards)
+    buffer.refresh()
+    add(buffer, 20)
+    buffer.rewards[:20] = 5
+    updates_until_refresh(buffer)
+    # 20 of 200 without a score, of r² = 25; the 180 others have 1: the mean is 3.4
+    np.testing.assert_allclose(buffer.scores[:20], 25 / 3.4, rtol=1e-5)
+    again = buffer.score_ages == 0
+    assert again.sum() == 40
+    np.testing.assert_allclose(buffer.scores[20:][again[20:]], 1 / 3.4, rtol=1e-5)
+    assert (buffer.buckets[:20] == 2).all()
+
+
+def test_a_refresh_waits_until_each_fold_has_a_transition_in_it():
+    """At one transition per update: three in a run of K would do; the newest two never do."""
+    buffer, worked_on = incremental(size=30, refresh_every=1, scored_per_update=1)
+    buffer.refresh(2)
+    assert (buffer.n_refreshes, worked_on) == (0, [])
+    waited = updates_until_refresh(buffer)
+    assert waited >= 3
+    assert [len(work) for work in worked_on] == [waited]
+
+
+def test_the_random_control_keeps_the_ranks_of_what_is_not_scored_again():
+    buffer, _ = incremental(stage_rule="random")
+    for _ in range(6):
+        before = buffer.scores.copy()
+        updates_until_refresh(buffer)
+        changed = buffer.scores != before
+        assert changed.sum() == 40
+        assert ((buffer.scores[changed] >= 0) & (buffer.scores[changed] < 1)).all()
 
 
 def test_a_buffer_smaller_than_a_teachers_minibatch_still_gets_its_curriculum():
@@ -525,6 +785,72 @@ def test_score_quantiles_rise_from_bucket_to_bucket():
 
 def test_scores_by_the_student_correlate_fully_with_the_student():
     assert scored_buffer().diagnostics()["curriculum/rank_correlation_with_student"] == pytest.approx(1)
+
+
+def test_the_mean_age_of_the_scores():
+    """
+    A refresh every 4 updates scores 40 of 200. After the fifth the scores are 0, 4, 8, 12, 16 updates old: 8 on average; three
+    updates later 11.
+    """
+    buffer, _ = incremental()
+    for _ in range(5):
+        updates_until_refresh(buffer)
+    assert buffer.diagnostics()["curriculum/score_age"] == 8
+    for _ in range(3):
+        buffer.sample(4)
+    assert buffer.diagnostics()["curriculum/score_age"] == 11
+
+
+def test_the_scores_shown_are_those_of_stored_transitions():
+    buffer = scored_buffer()
+    add(buffer, 100)
+    np.testing.assert_array_equal(buffer.diagnostics()["curriculum/scores"], buffer.scores[100:])
+
+
+# ---- what is kept
+
+
+def test_scores_of_different_ages_come_back():
+    """Refreshes, their choice of transitions, and draws go on to the bit."""
+    saved, of_saved = incremental()
+    restored, of_restored = incremental()
+    for _ in range(7):
+        add(saved, 15)
+        updates_until_refresh(saved)
+    saved.sample(4)
+    restored.set_state(deepcopy(saved.state()), saved.transitions())
+    restored.serial, restored.maker = saved.serial, np.random.default_rng(2)
+    saved.maker = np.random.default_rng(2)
+    del of_saved[:], of_restored[:]
+    for _ in range(9):
+        np.testing.assert_array_equal(saved.sample(32).rows, restored.sample(32).rows)
+        for buffer in (saved, restored):
+            add(buffer, 5)
+    assert of_saved == of_restored
+    assert len(of_saved) == 2
+    np.testing.assert_array_equal(saved.score_ages, restored.score_ages)
+
+
+def test_without_ages_all_were_scored_at_the_same_time():
+    """As files of format version 1 are."""
+    saved, _ = incremental()
+    saved.refresh()
+    state = saved.state()
+    del state["score_ages"]
+    restored, _ = incremental()
+    restored.set_state(state, saved.transitions())
+    assert restored.diagnostics()["curriculum/score_age"] == 0
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [np.full(200, -1), np.zeros(199, np.int64), np.zeros(200), np.zeros((200, 1), np.int64)],
+    ids=["negative", "fewer", "of floats", "in a table"],
+)
+def test_ages_that_are_none_are_refused(wrong):
+    saved, _ = incremental()
+    with pytest.raises(ValueError, match="not a replay buffer of this model: its score"):
+        incremental()[0].set_state({**saved.state(), "score_ages": wrong}, saved.transitions())
 
 
 # ---- settings

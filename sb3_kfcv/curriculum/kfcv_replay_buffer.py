@@ -11,14 +11,22 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from scipy.stats import spearmanr
 
 from sb3_kfcv.common.checks import require_between, require_count, require_finite
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.stacked_networks import at_most
-from sb3_kfcv.curriculum.difficulty import buckets_by_difficulty, combine_agents, cross_validated_errors
+from sb3_kfcv.curriculum.difficulty import (
+    UNSCORED,
+    buckets_by_difficulty,
+    combine_agents,
+    cross_validated_errors,
+    mean_of_the_living,
+    rank_correlation,
+    rows_to_score,
+    stratum_weights,
+)
 from sb3_kfcv.curriculum.folds import assign_folds, rows_per_fold
-from sb3_kfcv.curriculum.stages import STAGE_RULES, bucket_shares, stage_at, uniform_share
+from sb3_kfcv.curriculum.stages import STAGE_RULES, BucketMembers, bucket_shares, stage_at, uniform_share
 from sb3_kfcv.curriculum.teachers import Teachers
 from sb3_kfcv.replay.joint_replay_buffer import JointReplayBuffer, Student
 
@@ -27,26 +35,37 @@ SCORES = ("teachers", "student")
 # Rows that pass through the networks at once during a refresh: bounds the memory of their activations.
 CHUNK = 1024
 
-UNSCORED = -1
+# Rows whose student's δ² is compared with their scores at a refresh: a correlation is known to 0.03 from them.
+COMPARED = 1000
+
+# What is noted of each row.
+OF_EACH_ROW = ("folds", "scores", "score_ages", "buckets")
 
 
 class KFCVReplayBuffer(JointReplayBuffer):
     """
     K-Fold Cross Validation Curriculum Learning (KFCV-CL) over a replay buffer: section 4 and Algorithm 1 of Lin et al. 2022.
 
-    Every transition has a permanent fold. At each *refresh* K teachers are trained on their folds (eq. 9), every transition
-    is scored by the K − 1 teachers that have not seen it (eq. 10–11), and the transitions are ranked into K
+    Every transition has a permanent fold. At each *refresh* K teachers are trained on their folds (eq. 9), transitions
+    are scored by the K − 1 teachers that have not seen them (eq. 10–11), and all that have a score are ranked into K
     buckets. The stages then draw from easy to hard (eq. 12), beside a share λ drawn uniformly from the whole buffer.
-    Before the first refresh all draws are uniform; a transition that came after the last refresh is drawn by the uniform
-    share alone; after the curriculum's share of training all draws are uniform and refreshes stop.
+    Before the first refresh all draws are uniform; a transition without a score is drawn by the uniform share alone; after
+    the curriculum's share of training all draws are uniform and refreshes stop.
+
+    A refresh works on all transitions of a buffer of up to ``scored_per_update`` × ``refresh_every`` (8,750), and on so
+    many of a larger one: on those that have no score yet, the newest first, then on those whose scores are the oldest.
+    Targets, training and new scores are of these alone; a transition's fold is the same in each refresh, so no teacher
+    ever scores what it was trained on. Scores of different refreshes are ranked together; what makes them comparable is
+    :func:`~sb3_kfcv.curriculum.difficulty.stratum_weights`.
 
     It knows transitions and the TD target of the learner that it is attached to, no particular algorithm.
 
     :param n_folds: K: folds, teachers, buckets and stages
     :param refresh_every: updates between refreshes (Algorithm 1 as printed refreshes at every step, at many times the cost)
-    :param refresh_fraction: refresh sooner when this share of the transitions is new (beyond 1: never sooner)
-    :param scored_per_update: bound of the cost: refreshes are spaced so that at most this many transitions are scored
-        per update, whatever the size of the buffer and the number of worlds that fill it
+    :param refresh_fraction: refresh sooner when this share of the transitions is new (beyond 1: never sooner), as soon as
+        ``scored_per_update`` allows for all transitions
+    :param scored_per_update: bound of the cost: a refresh works on at most this many transitions per update since the last
+        one, whatever the size of the buffer and the number of worlds that fill it
     :param teacher_steps: gradient steps of the teachers per refresh
     :param first_teacher_steps: the same at the first refresh, from random networks
     :param teacher_batch_size: transitions per teacher and step
@@ -115,9 +134,11 @@ class KFCVReplayBuffer(JointReplayBuffer):
         self.lambda_init, self.curriculum_fraction = lambda_init, curriculum_fraction
 
         self.folds = assign_folds(n_rows, n_folds, self.rng)  # (rows,)
-        self.scores = np.zeros(n_rows)  # (rows,) c_j of the last refresh
+        self.scores = np.zeros(n_rows)  # (rows,) c_j when it was last scored
+        self.score_ages = np.zeros(n_rows, dtype=np.int64)  # (rows,) updates from then to the last refresh
         self.buckets = np.full(n_rows, UNSCORED, dtype=np.int32)  # (rows,) 0 … K−1, or UNSCORED
-        self._rows_of_bucket: list[np.ndarray] | None = None  # rebuilt after rows were overwritten or scored
+        self._members: BucketMembers | None = None  # made at the first draw after a ranking, with n_added of that time
+        self._ranked_at = 0
         self._updates_since_refresh = 0
         self._new_since_refresh = 0
         self.n_refreshes = 0
@@ -155,12 +176,11 @@ class KFCVReplayBuffer(JointReplayBuffer):
     def reset(self) -> None:
         super().reset()
         self.buckets[:] = UNSCORED
-        self._rows_of_bucket = None
+        self._members = None
 
     def add(self, *args: Any, **kwargs: Any) -> None:
         first = self.pos * self.n_envs
         self.buckets[first : first + self.n_envs] = UNSCORED
-        self._rows_of_bucket = None
         self._new_since_refresh += self.n_envs
         super().add(*args, **kwargs)
 
@@ -168,7 +188,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
         if self.stage <= self.n_folds:
             self._updates_since_refresh += 1
             if self._refresh_is_due():
-                self.refresh()
+                self.refresh(self._budget())
         elif self.n_refreshes == 0 and not self._warned:
             warnings.warn("the curriculum's share of training was over before learning began: all replay is uniform")
             self._warned = True
@@ -186,8 +206,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
         if self.stage > self.n_folds or self.n_refreshes == 0:
             return rows
         members = self._bucket_members()
-        sizes = np.array([len(rows_of) for rows_of in members])
-        shares = bucket_shares(self.stage, self.n_folds, self.stage_rule) * (sizes > 0)
+        shares = bucket_shares(self.stage, self.n_folds, self.stage_rule) * (members.sizes > 0)
         if shares.sum() == 0:  # all of the stage's transitions have been overwritten since the last refresh
             return rows
         shares *= (1 - self.lambda_now) / shares.sum()
@@ -195,81 +214,120 @@ class KFCVReplayBuffer(JointReplayBuffer):
         source = np.searchsorted(np.cumsum(shares), points, side="right")  # bucket, or K for the uniform share
         scored = source < self.n_folds
         bucket = source[scored]
-        place = np.cumsum(sizes)[bucket] - 1 - self.rng.integers(sizes[bucket])
-        rows[scored] = np.concatenate(members)[place]
+        sizes = members.sizes[bucket]
+        rows[scored] = members.rows(bucket, sizes - 1 - self.rng.integers(sizes))
         return rows
 
-    def _bucket_members(self) -> list[np.ndarray]:
-        if self._rows_of_bucket is None:
-            self._rows_of_bucket = [np.flatnonzero(self.buckets == bucket) for bucket in range(self.n_folds)]
-        return self._rows_of_bucket
+    def _bucket_members(self) -> BucketMembers:
+        next_row = self.pos * self.n_envs
+        if self._members is None:
+            self._members, self._ranked_at = BucketMembers(self.buckets, self.n_folds, next_row), self.n_added
+        self._members.forget(next_row, (self.n_added - self._ranked_at) * self.n_envs)
+        return self._members
 
     def _refresh_is_due(self) -> bool:
         n, waited = self.n_rows, self._updates_since_refresh
         if self.n_refreshes == 0:
             return n >= self.n_folds
         many_new = self._new_since_refresh >= self.refresh_fraction * n
-        return waited * self.scored_per_update >= n and (many_new or waited >= self.refresh_every)
+        return waited >= self.refresh_every or (many_new and waited * self.scored_per_update >= n)
 
-    def refresh(self) -> None:
-        """Train the teachers, score every transition, rank them into buckets: the assessment of section 4.1."""
+    def _budget(self) -> int:
+        """How many transitions a refresh may work on; the first one as if it were not sooner."""
+        waited = self._updates_since_refresh
+        return self.scored_per_update * (waited if self.n_refreshes else max(waited, self.refresh_every))
+
+    def refresh(self, at_most: int | None = None) -> None:
+        """
+        Train the teachers, score transitions, rank all that have a score into buckets: the assessment of section 4.1.
+
+        Waits for a larger ``at_most`` where these are so few that a fold has none of them.
+
+        :param at_most: how many transitions to work on, see :func:`~sb3_kfcv.curriculum.difficulty.rows_to_score`; by
+            default all
+        """
         start = time.perf_counter()
         n = self.n_rows
-        inputs, targets, values, live = self._read_all()
-        student_errors = (targets - values).square()
+        oldest = self.pos * self.n_envs if self.full else 0
+        known = self.buckets[:n] != UNSCORED
+        rows = rows_to_score(known, self.score_ages[:n], oldest, n if at_most is None else at_most)
+        members = rows_per_fold(self.folds[rows], self.n_folds)
+        if not all(len(places) for places in members):
+            return
+        weights = th.as_tensor(stratum_weights(known, rows), device=self.device)
+        inputs, targets, live = self._read(rows)
+        compared = slice(None, None, 1 if self.score == "student" else -(-len(rows) // COMPARED))
+        student_errors = (targets[:, compared] - self._student_values(rows[compared])).square()
         if self.score == "student":
-            scores = combine_agents(student_errors, live)
+            scores = combine_agents(student_errors, live, weights)
         else:
-            scores = self._teacher_scores(inputs, targets, live)
-        self._note_correlations(scores, combine_agents(student_errors, live))
+            scores = self._teacher_scores(inputs, targets, live, weights, self.folds[rows], members)
+        self._note_correlations(rows, scores, compared, combine_agents(student_errors, live[:, compared]))
         if self.stage_rule == "random":
-            scores = self.rng.random(n)
-        self.scores[:n] = scores
-        self.buckets[:n] = buckets_by_difficulty(scores, self.n_folds)
-        self._rows_of_bucket = None
+            scores = self.rng.random(len(rows))
+        self.scores[rows] = scores
+        self.score_ages[:n] += self._updates_since_refresh
+        self.score_ages[rows] = 0
+        self.buckets[rows] = 0
+        scored = np.flatnonzero(self.buckets[:n] != UNSCORED)
+        self.buckets[scored] = buckets_by_difficulty(self.scores[scored], self.n_folds)
+        self._members = None
         self._updates_since_refresh = self._new_since_refresh = 0
         self.n_refreshes += 1
         self._refresh_seconds += time.perf_counter() - start
 
-    def _read_all(self) -> tuple[th.Tensor, th.Tensor, th.Tensor, th.Tensor]:
-        """Teacher inputs (n, features); TD targets, the student's Q, and 1 where the agent lived, (agents, n), of all rows."""
-        n, student = self.n_rows, self.student
-        batches = (self.rows(np.arange(first, min(first + CHUNK, n))) for first in range(0, n, CHUNK))
-        parts = [
-            (student.teacher_inputs(batch), student.td_target(batch), student.q_values(batch), student.live(batch))
-            for batch in batches
-        ]
-        inputs, targets, values, live = zip(*parts, strict=True)
-        return th.cat(inputs), th.cat(targets, dim=1), th.cat(values, dim=1), th.cat(live, dim=1)
+    def _read(self, rows: np.ndarray) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Teacher inputs (n, features); TD targets, and 1 where the agent lived, (agents, n)."""
+        student = self.student
+        inputs = th.empty(len(rows), student.teacher_input_size, device=self.device)
+        targets, live = th.empty(2, student.n_learning_agents, len(rows), device=self.device)
+        for part in slices(len(rows)):
+            batch = self.rows(rows[part])
+            inputs[part] = student.teacher_inputs(batch)
+            targets[:, part], live[:, part] = student.td_target(batch), student.live(batch)
+        return inputs, targets, live
 
-    def _teacher_scores(self, inputs: th.Tensor, targets: th.Tensor, live: th.Tensor) -> np.ndarray:
+    def _student_values(self, rows: np.ndarray) -> th.Tensor:
+        """The student's Q, (agents, n)."""
+        return th.cat([self.student.q_values(self.rows(rows[part])) for part in slices(len(rows))], dim=1)
+
+    def _teacher_scores(
+        self,
+        inputs: th.Tensor,
+        targets: th.Tensor,
+        live: th.Tensor,
+        weights: th.Tensor,
+        folds: np.ndarray,
+        members: list[np.ndarray],
+    ) -> np.ndarray:
         """Train the teachers on their folds, and score every row by those that have not seen it (eq. 9–11): (n,)."""
         # Targets in units of their own spread: eq. 9 has the same minimum, and few steps come near it.
-        count = live.sum(1, keepdim=True).clamp(min=1)
-        targets = targets - (targets * live).sum(1, keepdim=True) / count
-        targets = targets / ((targets.square() * live).sum(1, keepdim=True) / count).sqrt().clamp(min=1e-6)
-        folds = self.folds[: self.n_rows]
+        targets = targets - mean_of_the_living(targets, live, weights)
+        targets = targets / mean_of_the_living(targets.square(), live, weights).sqrt().clamp(min=1e-6)
         steps = self.teacher_steps if self.n_refreshes else self.first_teacher_steps
-        members = rows_per_fold(folds, self.n_folds)
         in_fold_loss = self.teachers.fit(inputs, targets, live, members, steps, self.teacher_batch_size, self.rng)
+        errors, fold = th.empty_like(targets), th.as_tensor(folds, device=self.device)
         with th.no_grad():
-            values = th.cat([self.teachers.values(part.unsqueeze(0)) for part in inputs.split(CHUNK)], dim=2)
-            errors = cross_validated_errors(targets, values, th.as_tensor(folds, device=self.device))
+            for part in slices(len(folds)):
+                values = self.teachers.values(inputs[part].unsqueeze(0))
+                errors[:, part] = cross_validated_errors(targets[:, part], values, fold[part])
         held_out_loss = (errors * live).sum() / live.sum().clamp(min=1) / (self.n_folds - 1)
         self._stats["curriculum/teacher_loss_in_fold"] = in_fold_loss
         self._stats["curriculum/teacher_loss_held_out"] = held_out_loss.item()
-        return combine_agents(errors, live)
+        return combine_agents(errors, live, weights)
 
-    def _note_correlations(self, scores: np.ndarray, student_scores: np.ndarray) -> None:
-        """How the ranking agrees with that of the last refresh, and with the student's own squared TD error."""
-        known = self.buckets[: len(scores)] != UNSCORED
+    def _note_correlations(self, rows: np.ndarray, scores: np.ndarray, compared: slice, student_scores: np.ndarray) -> None:
+        """How the ranking agrees with the scores before, and with the student's own squared TD error."""
+        known = self.buckets[rows] != UNSCORED
         if known.sum() > 1:
-            last = self.scores[: len(scores)][known]
-            self._stats["curriculum/rank_correlation_with_last"] = rank_correlation(last, scores[known])
-        self._stats["curriculum/rank_correlation_with_student"] = rank_correlation(scores, student_scores)
+            self._stats["curriculum/rank_correlation_with_last"] = rank_correlation(self.scores[rows[known]], scores[known])
+        self._stats["curriculum/rank_correlation_with_student"] = rank_correlation(scores[compared], student_scores)
 
     def diagnostics(self) -> dict[str, Any]:
-        """Stage, λ, shares, score quantiles per bucket, the teachers' losses, rank correlations, and the scores themselves."""
+        """
+        Stage, λ, shares, score quantiles per bucket, the teachers' losses, rank correlations, the share of transitions
+        without a score, and the scores themselves with their mean age in updates.
+        """
         stats: dict[str, Any] = {
             **self._stats,
             "curriculum/stage": self.stage,
@@ -280,21 +338,26 @@ class KFCVReplayBuffer(JointReplayBuffer):
         if self.n_refreshes == 0 or self.stage > self.n_folds:
             return stats
         shares = bucket_shares(self.stage, self.n_folds, self.stage_rule) * (1 - self.lambda_now)
-        for bucket, rows in enumerate(self._bucket_members()):
+        scored = np.flatnonzero(self.buckets[: self.n_rows] != UNSCORED)
+        scores, buckets = self.scores[scored], self.buckets[scored]
+        for bucket in range(self.n_folds):
+            of_bucket = scores[buckets == bucket]
             stats[f"curriculum/share_bucket_{bucket + 1}"] = shares[bucket]
-            if len(rows):
-                low, median, high = np.quantile(self.scores[rows], [0.1, 0.5, 0.9])
+            if len(of_bucket):
+                low, median, high = np.quantile(of_bucket, [0.1, 0.5, 0.9])
                 stats[f"curriculum/score_bucket_{bucket + 1}_q10"] = low
                 stats[f"curriculum/score_bucket_{bucket + 1}_q50"] = median
                 stats[f"curriculum/score_bucket_{bucket + 1}_q90"] = high
-        stats["curriculum/unscored"] = float(np.mean(self.buckets[: self.n_rows] == UNSCORED))
-        stats["curriculum/scores"] = th.as_tensor(self.scores[: self.n_rows])
+        stats["curriculum/unscored"] = 1 - len(scored) / self.n_rows
+        if len(scored):
+            stats["curriculum/score_age"] = float(self.score_ages[scored].mean()) + self._updates_since_refresh
+            stats["curriculum/scores"] = th.as_tensor(scores)
         return stats
 
     def state(self) -> dict[str, Any]:
         return {
             **super().state(),
-            **{"folds": self.folds, "scores": self.scores, "buckets": self.buckets},
+            **{name: getattr(self, name) for name in OF_EACH_ROW},
             "updates_since_refresh": self._updates_since_refresh,
             "new_since_refresh": self._new_since_refresh,
             "n_refreshes": self.n_refreshes,
@@ -304,10 +367,15 @@ class KFCVReplayBuffer(JointReplayBuffer):
             "refresh_seconds": self._refresh_seconds,
         }
 
+    def set_state(self, state: dict[str, Any], transitions: dict[str, np.ndarray]) -> None:
+        # A file without ages is of a time when each refresh scored all transitions.
+        same_age = np.zeros(np.shape(state.get("scores", ())), dtype=np.int64)
+        super().set_state({"score_ages": same_age, **state}, transitions)
+
     def _set_bookkeeping(self, state: dict[str, Any], rows: np.ndarray, own_rows: np.ndarray) -> None:
         size = state["n_steps"] * state["n_envs"]
-        folds, scores, buckets = (state[name] for name in ("folds", "scores", "buckets"))
-        for name, values in (("folds", folds), ("scores", scores), ("buckets", buckets)):
+        folds, scores, ages, buckets = (state[name] for name in OF_EACH_ROW)
+        for name, values in zip(OF_EACH_ROW, (folds, scores, ages, buckets), strict=True):
             if values.shape != (size,) or values.dtype != getattr(self, name).dtype:
                 raise ValueError(f"not a replay buffer of this model: its {name} are {values.shape} of {values.dtype}")
         require_finite("scores of the replay buffer", scores)
@@ -317,6 +385,8 @@ class KFCVReplayBuffer(JointReplayBuffer):
             raise ValueError(f"not a replay buffer of this model: its folds are not 0 to {self.n_folds - 1}")
         if not ((buckets >= UNSCORED) & (buckets < self.n_folds)).all() or (buckets[n_rows:] != UNSCORED).any():
             raise ValueError("not a replay buffer of this model: its buckets are not those of its transitions")
+        if (ages < 0).any():
+            raise ValueError("not a replay buffer of this model: its scores have negative ages")
         for name in ("updates_since_refresh", "new_since_refresh", "n_refreshes"):
             require_count(name, state[name], least=0)
         require_between("refresh_seconds", state["refresh_seconds"], 0)
@@ -326,17 +396,15 @@ class KFCVReplayBuffer(JointReplayBuffer):
         self.teachers.load_state_dict(state["teachers"])
         self.buckets[:] = UNSCORED
         same = size == len(self.folds) and np.array_equal(rows, own_rows)
-        for name in ("folds", "scores", "buckets"):
+        for name in OF_EACH_ROW:
             values = getattr(self, name)
             values[slice(None) if same else own_rows] = state[name][slice(None) if same else rows]
         self._updates_since_refresh, self._new_since_refresh = state["updates_since_refresh"], state["new_since_refresh"]
         self.n_refreshes, self._warned = state["n_refreshes"], bool(state["warned"])
-        self._rows_of_bucket = None
+        self._members = None
         self._stats, self._refresh_seconds = stats, float(state["refresh_seconds"])
 
 
-def rank_correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Spearman's ρ; 0 where one of them is constant."""
-    if np.ptp(first) == 0 or np.ptp(second) == 0:
-        return 0.0
-    return float(spearmanr(first, second).statistic)
+def slices(n: int) -> list[slice]:
+    """0 … n − 1 in runs of ``CHUNK``."""
+    return [slice(first, min(first + CHUNK, n)) for first in range(0, n, CHUNK)]

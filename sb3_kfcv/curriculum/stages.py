@@ -57,3 +57,55 @@ def bucket_shares(stage: int, n_buckets: int, rule: str) -> np.ndarray:
     else:
         shares[:reached] = 1
     return shares / shares.sum()
+
+
+class BucketMembers:
+    """
+    The transitions of each bucket that have not been overwritten since they were ranked. What a draw costs depends on the
+    minibatch, hardly on the size of the buffer.
+
+    A buffer is overwritten in the order of its rows, round and round. So of its rows in ascending order a bucket has lost
+    one run (two, where the writing went on from the buffer's start), and a binary search finds where it ends.
+
+    :param buckets: bucket of each row, negative for none, (rows,)
+    :param n_buckets: K
+    :param next_row: the row that is written next
+    """
+
+    def __init__(self, buckets: np.ndarray, n_buckets: int, next_row: int) -> None:
+        self.n_rows = len(buckets)
+        scored = np.flatnonzero(buckets >= 0)
+        self._offsets = np.arange(n_buckets) * self.n_rows
+        self._keys = np.sort(self._offsets[buckets[scored]] + scored)  # bucket by bucket the rows, ascending
+        self._starts = np.searchsorted(self._keys, self._offsets)  # of each bucket
+        self._ends = np.searchsorted(self._keys, self._offsets + self.n_rows)
+        self._next_row, self._cuts = next_row, np.searchsorted(self._keys, self._offsets + next_row)
+        self.sizes = self._ends - self._starts  # (K,) number of transitions still held
+        self._lost_from, self._n_lost = self._cuts, np.zeros_like(self.sizes)
+
+    def forget(self, next_row: int, n_written: int) -> None:
+        """
+        Leave out what has been overwritten.
+
+        :param next_row: the row that is written next
+        :param n_written: number of rows written since they were ranked
+        """
+        cuts = np.searchsorted(self._keys, self._offsets + next_row)
+        if n_written >= self.n_rows:
+            self.sizes = np.zeros_like(self.sizes)
+        elif next_row >= self._next_row:
+            self._lost_from, self._n_lost = self._cuts, cuts - self._cuts
+            self.sizes = self._ends - self._starts - self._n_lost
+        else:
+            self._lost_from, self._n_lost = self._starts, cuts - self._starts
+            self.sizes = self._cuts - cuts
+
+    def rows(self, buckets: np.ndarray, places: np.ndarray) -> np.ndarray:
+        """
+        :param buckets: which buckets, (n,)
+        :param places: which of each bucket's transitions that are still held, in ascending order, 0 … size − 1, (n,)
+        :return: their rows, (n,)
+        """
+        positions = self._starts[buckets] + places
+        positions += (positions >= self._lost_from[buckets]) * self._n_lost[buckets]
+        return self._keys[positions] - self._offsets[buckets]
