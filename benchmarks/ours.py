@@ -49,6 +49,8 @@ from sb3_kfcv.vec_env.joint_env import joint_box
 PACKAGES = ["sb3-kfcv", "stable_baselines3", "torch", "numpy", "numba"]
 STATE_SIZE = 150
 """Of the world's state in the case of 28 agents."""
+REFRESHED = 250 * 35
+"""Transitions that a refresh works on at most, at the defaults: ``refresh_every`` times ``scored_per_update``."""
 
 
 class RandomWorld(gym.Env):

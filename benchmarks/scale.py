@@ -32,7 +32,7 @@ import numpy as np
 import psutil
 import torch as th
 from matplotlib.ticker import EngFormatter, FuncFormatter
-from ours import PACKAGES, RandomWorld, learner, random_steps, simulate
+from ours import PACKAGES, REFRESHED, RandomWorld, learner, random_steps, simulate
 from peers.protocol import BATCH_SIZE, BUFFER_SIZE, Work, cpu_model, in_units, seconds_per_operation, versions_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for ``zoo``
@@ -215,7 +215,7 @@ def refresh_seconds(effort: Effort, n_rows: int, k: int) -> list[float]:
     """Seconds of a refresh, of each block of one."""
     settings = {"n_folds": k, "first_teacher_steps": 25}
     model: Any = learner(*MEDIUM, KFCVMADDPG, n_rows, min(N_ENVS, n_rows // 32), 0, replay_buffer_kwargs=settings)
-    return seconds_per_operation(Work(model.replay_buffer.refresh), effort.repeats, 0.0)
+    return seconds_per_operation(Work(partial(model.replay_buffer.refresh, REFRESHED)), effort.repeats, 0.0)
 
 
 def replay(effort: Effort) -> Iterator[Curve]:

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from ours import PACKAGES, STATE_SIZE, end_to_end, learner, random_steps, simulate
+from ours import PACKAGES, REFRESHED, STATE_SIZE, end_to_end, learner, random_steps, simulate
 from peers.protocol import (
     BATCH_SIZE,
     BUFFER_SIZE,
@@ -66,7 +66,7 @@ FULL = Effort(
     repeats=5,
     block_seconds=0.2,
     buffer_sizes=(5000, 200_000),
-    refreshes=((1000, 5), (5000, 2), (5000, 5), (5000, 10), (20_000, 5)),
+    refreshes=((1000, 5), (5000, 2), (5000, 5), (5000, 10), (20_000, 5), (200_000, 5)),
     n_worlds=(1, 32, 64, 1024),
     end_to_end_updates=50,
 )
@@ -227,7 +227,7 @@ def refreshes(effort: Effort) -> Iterator[Row]:
             *sizes, KFCVMADDPG, size, critic_input=critic_input, replay_buffer_kwargs={"n_folds": k, "first_teacher_steps": 25}
         )
         assert isinstance(model, KFCVMADDPG)
-        work = Work(model.replay_buffer.refresh)  # type: ignore[attr-defined]
+        work = Work(partial(model.replay_buffer.refresh, REFRESHED))  # type: ignore[attr-defined]
         seconds = seconds_per_operation(work, effort.repeats, 0.0)
         work_text = f'N = {sizes[0]}, critic_input="{critic_input}", {size:,} transitions, K = {k}, 25 teacher steps'
         yield Row("refresh", work_text, "refresh", seconds)

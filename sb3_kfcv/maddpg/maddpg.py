@@ -363,7 +363,7 @@ class MADDPG(SaveableAlgorithm):
     def q_values(self, batch: JointReplayBufferSamples) -> th.Tensor:
         """(agents, batch): each learning agent's first critic."""
         inputs = self._critic_inputs(batch.observations, batch.states, self.policy.encode(batch.actions), batch.alive)
-        return self.critic(inputs)[0]
+        return self.critic.evaluate(inputs)[0].clone()
 
     @property
     def _teachers_see_state(self) -> bool:
