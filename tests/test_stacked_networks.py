@@ -1,5 +1,7 @@
 """A stack of networks is what as many separate networks are: outputs, gradients, Adam steps, clipping."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch as th
@@ -109,6 +111,15 @@ def test_evaluations_follow_a_change_of_type():
     stack.evaluate(x)
     stack.double()
     assert stack.evaluate(x.double()).dtype == th.double
+
+
+def test_a_copy_evaluates_with_its_own_parameters():
+    stack, x = stack_and_input(False)
+    stack.evaluate(x)
+    other = copy.deepcopy(stack)
+    nn.init.ones_(other.rest[-1].bias)
+    close(other.evaluate(x), other(x))
+    close(stack.evaluate(x), stack(x))
 
 
 def test_a_borrower_evaluates_in_the_tensors_of_its_lender():

@@ -292,7 +292,7 @@ class Evaluation:
 
     def __init__(self, stack: StackedMLP, batch: int, lender: Evaluation | None = None) -> None:
         self.stack, self.batch = stack, batch
-        self.relu = isinstance(stack.activation, nn.ReLU)
+        self.relu = type(stack.activation) is nn.ReLU
         self.members, self.wide_rows, self.width = None if stack.folds else stack.members, stack.wide_rows, stack.sizes[1]
         self.shape = (stack.n_members, batch)
         if stack.folds:
