@@ -16,7 +16,8 @@ class LeanAdam(th.optim.Adam):
     through ``torch.optim.Adam``. All parameters are of one device and type, and all have gradients or none has.
     """
 
-    _found: tuple[list[th.Tensor], ...] | None = None  # parameters, first and second moments, step counts
+    # Parameters, first and second moments, step counts, and these in one tensor
+    _found: tuple[list[th.Tensor], list[th.Tensor], list[th.Tensor], list[th.Tensor], th.Tensor] | None = None
 
     @th.no_grad()
     def step(self, closure: Any = None) -> Any:
@@ -33,12 +34,15 @@ class LeanAdam(th.optim.Adam):
             loss = super().step()  # makes the state
             parameters = [parameter for parameter in group["params"] if parameter.grad is not None]
             states = [self.state[parameter] for parameter in parameters]
+            all_steps = th.stack([state["step"] for state in states])
+            for state, steps in zip(states, all_steps, strict=True):
+                state["step"] = steps
             moments = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
-            self._found = parameters, *moments
+            self._found = parameters, *moments, all_steps  # type: ignore[assignment]
             return loss
-        parameters, exp_avgs, exp_avg_sqs, steps = self._found
+        parameters, exp_avgs, exp_avg_sqs, steps, all_steps = self._found
+        all_steps.add_(1)
         beta1, beta2 = group["betas"]
-        th._foreach_add_(steps, 1)
         th._fused_adam_(
             parameters,
             [parameter.grad for parameter in parameters],  # type: ignore[misc]

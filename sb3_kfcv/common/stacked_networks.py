@@ -299,7 +299,9 @@ class Evaluation:
             self.shape = (stack.n_networks, stack.n_members // stack.n_networks * batch)
         self.parameters: list[tuple[nn.Parameter, nn.Parameter]] = [(layer.weight, layer.bias) for layer in stack.rest]  # type: ignore[misc]
         self.weights = [(weight.detach(), bias.detach()) for weight, bias in self.parameters]
+        self.transposed = [weight.transpose(1, 2) for weight, _ in self.weights]
         self.first, self.first_bias = stack.first.weight.detach(), stack.first.bias.detach()
+        self.pointer = self.first.data_ptr()
         self.member_bias = None if stack.member_bias is None else stack.member_bias.detach()
         self.x = self.first  # the input, once there is one
         self.graphs: list[tuple[th.Tensor, th.Tensor]] = []  # of activations other than ReLU: what went in and what came out
@@ -324,7 +326,7 @@ class Evaluation:
 
     def fits(self, stack: StackedMLP) -> bool:
         """Whether it is for the parameters as they are: a module's ``to`` replaces their data."""
-        return stack.first.weight.data_ptr() == self.first.data_ptr()
+        return stack.first.weight.data_ptr() == self.pointer
 
     def first_layer(self, x: th.Tensor) -> th.Tensor:
         """
@@ -367,9 +369,8 @@ class Evaluation:
         for i in reversed(range(len(self.weights))):
             if parameters:
                 self._write_gradients(self._hidden(i), gradient, *self.parameters[i])
-            weight, _ = self.weights[i]
-            weight = weight if self.members is None else weight[self.members]
-            gradient = th.bmm(gradient, weight.transpose(1, 2), out=self.gradients[i])
+            weight = self.transposed[i] if self.members is None else self.transposed[i][self.members]
+            gradient = th.bmm(gradient, weight, out=self.gradients[i])
             self._through_activation(i, gradient, parameters)
         if parameters:
             self._write_first_gradients()

@@ -31,7 +31,7 @@ class Diagnostics:
         self._continuous = not layout.discrete
         groups = [layout.groups[i] for i in agents]
         self._positions = {group: [p for p, g in enumerate(groups) if g == group] for group in dict.fromkeys(groups)}
-        self._critic_losses: deque[th.Tensor] = deque(maxlen=WINDOW)  # each (agents,)
+        self._critic_losses: deque[th.Tensor] = deque(maxlen=WINDOW)  # each (critics, agents), or their mean (agents,)
         self._targets: deque[th.Tensor] = deque(maxlen=WINDOW)  # each (agents,)
         self._actor_losses: deque[th.Tensor] = deque(maxlen=WINDOW)  # each (agents,)
         self._own_actions: list[th.Tensor] = []
@@ -40,14 +40,14 @@ class Diagnostics:
 
     def critics(self, losses: th.Tensor, targets: th.Tensor) -> None:
         """Note an update of the critics: losses (critics, agents), TD targets (agents, batch)."""
-        self._critic_losses.append(losses.detach().mean(0))
+        self._critic_losses.append(losses)
         self._targets.append(targets.mean(-1))
         self._norms.pop("critic", None)
 
     def actors(self, losses: th.Tensor, own_actions: list[th.Tensor]) -> None:
         """Note an update of the actors: losses (agents,), their actions per block (agents, batch, action)."""
-        self._actor_losses.append(losses.detach())
-        self._own_actions = [actions.detach() for actions in own_actions]
+        self._actor_losses.append(losses)
+        self._own_actions = own_actions
         self._norms.pop("actor", None)
 
     def series(self, actor: StackedActors, critic: CentralCritics) -> dict[str, float]:
@@ -59,11 +59,11 @@ class Diagnostics:
         """
         values: dict[str, float] = {"time/update_seconds": self.update_seconds}
         if self._critic_losses:
-            self._per_group(values, "train/critic_loss", th.stack(tuple(self._critic_losses)))
-            self._per_group(values, "train/q_target", th.stack(tuple(self._targets)))
+            self._per_group(values, "train/critic_loss", _stacked(self._critic_losses))
+            self._per_group(values, "train/q_target", _stacked(self._targets))
             values["train/critic_grad_norm"] = self._norms.get("critic") or _mean_norm(critic)
         if self._actor_losses:
-            self._per_group(values, "train/actor_loss", th.stack(tuple(self._actor_losses)))
+            self._per_group(values, "train/actor_loss", _stacked(self._actor_losses))
             values["train/actor_grad_norm"] = self._norms.get("actor") or _mean_norm(actor)
             if self._continuous:
                 saturated = th.cat([(actions.abs() > SATURATED).float().flatten() for actions in self._own_actions])
@@ -74,7 +74,7 @@ class Diagnostics:
         """Everything that :meth:`series` will show, as plain values; the networks are those of :meth:`series`."""
         logged = self.series(actor, critic)
         return {
-            **{name: th.stack(tuple(noted)) if noted else None for name, noted in self._noted().items()},
+            **{name: _stacked(noted) if noted else None for name, noted in self._noted().items()},
             "own_actions": self._own_actions,
             "norms": {n: logged[f"train/{n}_grad_norm"] for n in ("actor", "critic") if f"train/{n}_grad_norm" in logged},
             "update_seconds": self.update_seconds,
@@ -97,6 +97,11 @@ class Diagnostics:
         if len(self._positions) > 1:
             for group, positions in self._positions.items():
                 values[f"{key}_{group}"] = stacked[:, positions].mean().item()
+
+
+def _stacked(noted: deque[th.Tensor]) -> th.Tensor:
+    """What was noted of each update, of several critics the mean: (updates, agents)."""
+    return th.stack([values if values.ndim == 1 else values.mean(0) for values in noted])
 
 
 def _mean_norm(networks: StackedActors | CentralCritics) -> float:

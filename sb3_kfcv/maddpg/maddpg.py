@@ -399,7 +399,7 @@ class MADDPG(SaveableAlgorithm):
         :param losses: (agents,) or (critics, agents)
         :raises NonFiniteError: names the learning agent whose loss is not finite; no network has changed
         """
-        if not math.isfinite(losses.sum().item()):
+        if not math.isfinite(sum(losses.flatten().tolist())):
             columns = {self.layout.agents[agent]: slice(i, i + 1) for i, agent in enumerate(self.agents)}
             rows = losses.cpu().numpy().reshape(-1, len(columns))
             require_finite_columns(f"{quantity} in update {self._n_updates:,}", rows, columns)

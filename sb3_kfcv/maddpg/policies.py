@@ -69,7 +69,7 @@ class _Columns:
     """Equal-sized column ranges of a joint row, read and written as (agents, batch, size); a view where they adjoin."""
 
     def __init__(self, slices: Sequence[slice]) -> None:
-        self.count = len(slices)
+        self.count, self.size = len(slices), slices[0].stop - slices[0].start
         self.index = th.tensor([list(range(s.start, s.stop)) for s in slices])  # (agents, size)
         flat = self.index.flatten()
         adjoin = bool((flat == th.arange(len(flat)) + flat[0]).all())
@@ -77,7 +77,7 @@ class _Columns:
 
     def read(self, rows: th.Tensor) -> th.Tensor:
         """(batch, joint) → (agents, batch, size)."""
-        return rows[:, self.range].unflatten(1, (self.count, -1)).transpose(0, 1)
+        return rows[:, self.range].view(len(rows), self.count, self.size).transpose(0, 1)
 
     def write(self, rows: th.Tensor, values: th.Tensor) -> None:
         """Put (agents, batch, size) into (batch, joint)."""
