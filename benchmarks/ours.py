@@ -159,10 +159,8 @@ def simulate(worlds: ParticleWorlds) -> Work:
 
     def steps() -> None:
         for forces in actions:
-            worlds.step(forces)
-            over = worlds.episode_terminated | worlds.episode_truncated
-            if over.any():
-                worlds.reset(np.flatnonzero(over))
+            if worlds.step(forces):
+                worlds.reset(np.flatnonzero(worlds.episode_terminated | worlds.episode_truncated))
 
     return Work(steps, EPISODE_STEPS * worlds.n_worlds)
 

@@ -114,6 +114,33 @@ def test_worlds_can_be_pickled(make):
 
 
 @every_world
+def test_a_copy_goes_its_own_way(make):
+    worlds = make(2)
+    worlds.reset()
+    actions = random_actions(worlds, np.random.default_rng(0))
+    worlds.step(actions)
+    other = copy.deepcopy(worlds)
+    before = worlds.get_world(1)
+    other.step(actions)
+    assert other.steps.tolist() == [2, 2]
+    for name, value in worlds.get_world(1).items():
+        np.testing.assert_array_equal(value, before[name], err_msg=name)
+
+
+@every_world
+def test_a_step_tells_how_many_episodes_are_over(make):
+    worlds = make(3)
+    worlds.max_steps = 2
+    worlds.seed(range(3))
+    worlds.reset()
+    rng = np.random.default_rng(0)
+    assert worlds.step(random_actions(worlds, rng)) == 0
+    worlds.reset([1])
+    assert worlds.step(random_actions(worlds, rng)) == 2
+    assert (worlds.episode_terminated | worlds.episode_truncated).tolist() == [True, False, True]
+
+
+@every_world
 def test_reset_leaves_the_other_worlds_alone(make):
     worlds = make(3)
     worlds.reset()
@@ -193,6 +220,17 @@ def test_an_action_that_is_not_finite_is_named(bad):
     actions[2, 1, 0] = bad
     with pytest.raises(ValueError, match=r"agent_1 in world 2 is .*; it must be finite"):
         worlds.step(actions)
+    assert worlds.steps.tolist() == [0, 0, 0]  # nothing has moved
+
+
+def test_forces_may_be_of_any_type_and_in_any_order():
+    worlds, other = HardSpreadWorlds(3, n_agents=2), HardSpreadWorlds(3, n_agents=2)
+    forces = np.random.default_rng(0).integers(-1, 2, (3, 2, 2))
+    for batch, given in ((worlds, forces.astype(np.float64)), (other, np.asfortranarray(forces, dtype=np.float32))):
+        batch.seed(range(3))
+        batch.reset()
+        batch.step(given)
+    np.testing.assert_array_equal(worlds.positions, other.positions)
 
 
 @pytest.mark.parametrize("bad", [-1, 5, 1.5, np.nan])

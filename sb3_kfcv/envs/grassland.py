@@ -9,7 +9,7 @@ from numba import njit
 
 from sb3_kfcv.envs import physics
 from sb3_kfcv.envs.drawing import PALETTE, Disc, Scene
-from sb3_kfcv.envs.particle_worlds import ParticleWorlds, require_at_least
+from sb3_kfcv.envs.particle_worlds import REFUSED, ParticleWorlds, require_at_least
 
 # Section 5.2 of the paper, with the bodies of Grassland in https://github.com/qian18long/epciclr2020
 HALF_SIZE = 1.0
@@ -41,6 +41,9 @@ GRASS_REWARD = 2.0
 
 FADE_STEPS = 5
 """For so many steps a picture shows a sheep that was eaten."""
+
+BODY = 5
+"""What an agent sees of each body: position, velocity, and that it lives."""
 
 # Columns of GrasslandArrays.totals: sums over the episode, and over all wolves or all sheep
 WOLF_DISTANCE, WOLF_CAPTURE, WOLF_BOUNDARY = 0, 1, 2
@@ -143,15 +146,17 @@ class GrasslandWorlds(ParticleWorlds):
         return self._arrays_of_grassland
 
     def _reset(self, worlds: np.ndarray) -> None:
-        _reset(worlds, self._common, self._own, self.n_wolves)
+        _reset(worlds, self._handle, self.n_wolves)
 
-    def _step(self, actions: np.ndarray) -> None:
-        _step(actions, self._common, self._own, self.n_wolves, self.phi, self.sheep_pays_each, self.max_steps)
+    def _step(self, actions: np.ndarray) -> int:
+        return _step(actions, self._handle, self.n_wolves, self.phi, self.sheep_pays_each, self.max_steps)
 
     def states(self) -> np.ndarray:
-        alive = self.alive[..., np.newaxis]
-        parts = (self.positions * alive, self.velocities * alive, alive, self.grass, self.obstacles)
-        return np.concatenate([part.reshape(self.n_worlds, -1) for part in parts], axis=1, dtype=np.float32)
+        rows = (self.n_worlds, -1)
+        alive = np.repeat(self.alive, 2, axis=1)  # (E, 2n), for x and y
+        positions, velocities = self.positions.reshape(rows) * alive, self.velocities.reshape(rows) * alive
+        parts = (positions, velocities, self.alive, self.grass.reshape(rows), self.obstacles.reshape(rows))
+        return np.concatenate(parts, axis=1, dtype=np.float32)
 
     def episode_metrics(self) -> np.ndarray:
         totals = self._own.totals
@@ -188,15 +193,15 @@ class GrasslandWorlds(ParticleWorlds):
 
 
 @njit(cache=True, nogil=True)
-def _reset(worlds, common, own, n_wolves):
+def _reset(worlds, handle, n_wolves):
     """
     Start new episodes.
 
     :param worlds: indices of the worlds
-    :param common: WorldArrays
-    :param own: GrasslandArrays
+    :param handle: on WorldArrays and GrasslandArrays
     :param n_wolves: the agents after so many are sheep
     """
+    common, own = handle.common, handle.own
     for world in worlds:
         obstacles = own.obstacles[world]
         for k in range(obstacles.shape[0]):
@@ -254,15 +259,19 @@ def _draw_grass(rng, world, position, obstacles):
 
 
 @njit(cache=True, nogil=True)
-def _step(actions, common, own, n_wolves, phi, sheep_pays_each, max_steps):
+def _step(actions, handle, n_wolves, phi, sheep_pays_each, max_steps):
     """
     Step all worlds: forces, motion, rewards, deaths, metrics, observations.
 
     :param actions: (E, n, 2)
-    :param common: WorldArrays
-    :param own: GrasslandArrays
+    :param handle: on WorldArrays and GrasslandArrays
+    :return: number of worlds whose episode is over; REFUSED, and nothing was done, if an action is not finite
     """
+    if not physics.all_finite(actions):
+        return REFUSED
+    common, own = handle.common, handle.own
     n_worlds, n, _ = actions.shape
+    n_over = 0
     radii = np.full(n, SHEEP_RADIUS)
     radii[:n_wolves] = WOLF_RADIUS
     accelerations = np.full(n, SHEEP_ACCELERATION)
@@ -306,7 +315,9 @@ def _step(actions, common, own, n_wolves, phi, sheep_pays_each, max_steps):
         common.episode_truncated[world] = sheep_left and common.steps[world] >= max_steps
         for i in range(n):
             common.terminated[world, i] = not (alive[i] and sheep_left)
+        n_over += common.episode_terminated[world] or common.episode_truncated[world]
         _observe(common.observations[world], positions, velocities, alive, grass, obstacles)
+    return n_over
 
 
 @njit(cache=True)
@@ -386,34 +397,46 @@ def _observe(observations, positions, velocities, alive, grass, obstacles):
     :param observations: joint row, filled; zeros for dead agents and where others are dead
     """
     n = positions.shape[0]
-    observations[:] = 0.0
     size = observations.shape[0] // n
+    first_other = BODY + 2 * grass.shape[0]
+    first_obstacle = first_other + BODY * (n - 1)
+    bodies = np.zeros(BODY * n)  # what there is to see of everybody, side by side; zeros for the dead
+    origin = np.zeros(BODY * n)  # where it is seen from: added to the position of each of the living, zeros elsewhere
+    for j in range(n):
+        if alive[j]:
+            bodies[BODY * j] = positions[j, 0]
+            bodies[BODY * j + 1] = positions[j, 1]
+            bodies[BODY * j + 2] = velocities[j, 0]
+            bodies[BODY * j + 3] = velocities[j, 1]
+            bodies[BODY * j + 4] = 1.0
     for i in range(n):
+        own = observations[i * size : (i + 1) * size]
         if not alive[i]:
+            own[:] = 0.0
             continue
         x, y = positions[i, 0], positions[i, 1]
-        column = i * size
-        observations[column] = velocities[i, 0]
-        observations[column + 1] = velocities[i, 1]
-        observations[column + 2] = x
-        observations[column + 3] = y
-        observations[column + 4] = 1.0
-        column += 5
+        own[0] = velocities[i, 0]
+        own[1] = velocities[i, 1]
+        own[2] = x
+        own[3] = y
+        own[4] = 1.0
         for k in range(grass.shape[0]):
-            observations[column] = grass[k, 0] - x
-            observations[column + 1] = grass[k, 1] - y
-            column += 2
+            own[BODY + 2 * k] = grass[k, 0] - x
+            own[BODY + 2 * k + 1] = grass[k, 1] - y
         for j in range(n):
-            if j == i:
-                continue
             if alive[j]:
-                observations[column] = positions[j, 0] - x
-                observations[column + 1] = positions[j, 1] - y
-                observations[column + 2] = velocities[j, 0]
-                observations[column + 3] = velocities[j, 1]
-                observations[column + 4] = 1.0
-            column += 5
+                origin[BODY * j] = x
+                origin[BODY * j + 1] = y
+        before = BODY * i
+        _subtract(own[first_other : first_other + before], bodies[:before], origin[:before])
+        _subtract(own[first_other + before : first_obstacle], bodies[before + BODY :], origin[before + BODY :])
         for k in range(obstacles.shape[0]):
-            observations[column] = obstacles[k, 0] - x
-            observations[column + 1] = obstacles[k, 1] - y
-            column += 2
+            own[first_obstacle + 2 * k] = obstacles[k, 0] - x
+            own[first_obstacle + 2 * k + 1] = obstacles[k, 1] - y
+
+
+@njit(cache=True)
+def _subtract(difference, these, those):
+    """Fill ``difference`` with ``these`` less ``those``."""
+    for column in range(difference.shape[0]):
+        difference[column] = these[column] - those[column]

@@ -12,7 +12,7 @@ from numba import njit
 
 from sb3_kfcv.envs import physics
 from sb3_kfcv.envs.drawing import PALETTE, Disc, Rectangle, Scene
-from sb3_kfcv.envs.particle_worlds import ParticleWorlds, require_at_least
+from sb3_kfcv.envs.particle_worlds import REFUSED, ParticleWorlds, require_at_least
 
 # Sizes of section 5.1 of the paper, with the bodies of Hard Spread in
 # https://github.com/jiayu-ch15/Variational-Automatic-Curriculum-Learning
@@ -143,13 +143,12 @@ class HardSpreadWorlds(ParticleWorlds):
             self._own.walls_drawn[:] = False
 
     def _reset(self, worlds: np.ndarray) -> None:
-        _reset(worlds, self._common, self._own, self.wall_width, self.door, self.walls == "fixed")
+        _reset(worlds, self._handle, self.wall_width, self.door, self.walls == "fixed")
 
-    def _step(self, actions: np.ndarray) -> None:
-        _step(
+    def _step(self, actions: np.ndarray) -> int:
+        return _step(
             actions,
-            self._common,
-            self._own,
+            self._handle,
             self.wall_width,
             self.door,
             self.phi,
@@ -242,17 +241,17 @@ def _check_rooms(walls: list[tuple[float, float]], wall_width: float, door: floa
 
 
 @njit(cache=True, nogil=True)
-def _reset(worlds, common, own, wall_width, door, keep_walls):
+def _reset(worlds, handle, wall_width, door, keep_walls):
     """
     Start new episodes.
 
     :param worlds: indices of the worlds
-    :param common: WorldArrays
-    :param own: HardSpreadArrays
+    :param handle: on WorldArrays and HardSpreadArrays
     :param wall_width: width of the walls
     :param door: height of the doors
     :param keep_walls: whether walls that are drawn now stay for later episodes
     """
+    common, own = handle.common, handle.own
     for world in worlds:
         if not own.walls_drawn[world]:
             _draw_walls(common.rng, world, own.inner_walls[world], wall_width, door)
@@ -329,15 +328,19 @@ def touches_wall(position, walls, wall_width, door):
 
 
 @njit(cache=True, nogil=True)
-def _step(actions, common, own, wall_width, door, phi, exclusive_cover, max_steps):
+def _step(actions, handle, wall_width, door, phi, exclusive_cover, max_steps):
     """
     Step all worlds: forces, motion, rewards, metrics, observations.
 
     :param actions: (E, n, 2)
-    :param common: WorldArrays
-    :param own: HardSpreadArrays
+    :param handle: on WorldArrays and HardSpreadArrays
+    :return: number of worlds whose episode is over; REFUSED, and nothing was done, if an action is not finite
     """
+    if not physics.all_finite(actions):
+        return REFUSED
+    common, own = handle.common, handle.own
     n_worlds, n, _ = actions.shape
+    n_over = 0
     radii = np.full(n, AGENT_RADIUS)
     max_speeds = np.full(n, np.inf)
     forces = np.empty((n, 2))
@@ -382,7 +385,9 @@ def _step(actions, common, own, wall_width, door, phi, exclusive_cover, max_step
 
         common.steps[world] += 1
         common.episode_truncated[world] = common.steps[world] >= max_steps
+        n_over += common.episode_truncated[world]
         _observe(common.observations[world], positions, velocities, landmarks)
+    return n_over
 
 
 @njit(cache=True)

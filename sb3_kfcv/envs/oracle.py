@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from sb3_kfcv.envs.physics import DT
 from sb3_kfcv.envs.steering import KEPT, approach_velocity, force_for
@@ -28,6 +27,8 @@ def assign(costs: np.ndarray) -> np.ndarray:
     :param costs: cost of each goal for each agent (B, n, n)
     :return: goal of each agent (B, n)
     """
+    from scipy.optimize import linear_sum_assignment  # slow to import, and few need it
+
     return np.stack([linear_sum_assignment(cost)[1] for cost in costs])
 
 

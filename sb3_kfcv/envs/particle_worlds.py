@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
 from sb3_kfcv.envs import physics
+from sb3_kfcv.envs.compiled import Handle, handle_of
 from sb3_kfcv.envs.drawing import Scene
 
 DISCRETE_DIRECTIONS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 """Force of each discrete action: stay, +x, −x, +y, −y."""
+REFUSED = -1
+"""What a compiled step gives instead of the number of episodes that are over, if an action is not finite."""
 
 
 class WorldArrays(NamedTuple):
@@ -123,8 +127,21 @@ class ParticleWorlds(ABC):
         """Start new episodes in the worlds of these indices."""
 
     @abstractmethod
-    def _step(self, actions: np.ndarray) -> None:
-        """Step all worlds; actions are finite, (E, n, 2)."""
+    def _step(self, actions: np.ndarray) -> int:
+        """
+        Step all worlds.
+
+        :param actions: float64 (E, n, 2)
+        :return: number of worlds whose episode is over; ``REFUSED``, and nothing was done, if an action is not finite
+        """
+
+    @cached_property
+    def _handle(self) -> Handle:
+        """The arrays, as compiled functions take them."""
+        return handle_of(self._common, self._own)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_handle"}  # a copy has arrays of its own
 
     @abstractmethod
     def states(self) -> np.ndarray:
@@ -172,26 +189,26 @@ class ParticleWorlds(ABC):
         """
         self._reset(np.arange(self.n_worlds) if worlds is None else np.asarray(worlds, dtype=np.int64))
 
-    def step(self, actions: np.ndarray) -> None:
+    def step(self, actions: np.ndarray) -> int:
         """
         Step all worlds at once; the result is read from the arrays.
 
         :param actions: forces (E, n, 2), of which what lies outside [−1, 1] is clipped; or (E, n) integers in 0…4
+        :return: number of worlds whose episode is over
         :raises ValueError: for a wrong shape, and for values that are no actions, naming the first world and agent
         """
         actions = np.asarray(actions)
         if self.continuous_actions:
             self._check_shape(actions, (self.n_worlds, self.n_agents, 2))
-            finite = np.isfinite(actions)
-            if not finite.all():
-                self._refuse(actions, ~finite.all(axis=-1), "finite numbers")
-            self._step(actions.astype(np.float64, copy=False))
-        else:
-            self._check_shape(actions, (self.n_worlds, self.n_agents))
-            valid = (actions >= 0) & (actions < len(DISCRETE_DIRECTIONS)) & (actions % 1 == 0)
-            if not valid.all():
-                self._refuse(actions, ~valid, f"an integer from 0 to {len(DISCRETE_DIRECTIONS) - 1}")
-            self._step(DISCRETE_DIRECTIONS[actions.astype(np.int64, copy=False)])
+            n_over = self._step(np.asarray(actions, dtype=np.float64, order="C"))
+            if n_over == REFUSED:
+                self._refuse(actions, ~np.isfinite(actions).all(axis=-1), "finite numbers")
+            return n_over
+        self._check_shape(actions, (self.n_worlds, self.n_agents))
+        valid = (actions >= 0) & (actions < len(DISCRETE_DIRECTIONS)) & (actions % 1 == 0)
+        if not valid.all():
+            self._refuse(actions, ~valid, f"an integer from 0 to {len(DISCRETE_DIRECTIONS) - 1}")
+        return self._step(DISCRETE_DIRECTIONS[actions.astype(np.int64, copy=False)])
 
     def get_world(self, world: int) -> dict[str, np.ndarray]:
         """The whole state of a world, from which it continues exactly: random generator, episode, metrics."""

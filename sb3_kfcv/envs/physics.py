@@ -19,26 +19,9 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
+from sb3_kfcv.envs.compiled import drop_stale_cache
 
-def drop_stale_cache(source: Path = Path(__file__)) -> None:
-    """
-    Delete compiled code that is older than this file.
-
-    numba's disk cache looks at the file of a compiled function alone, not at the files of what it calls, so that the
-    worlds would go on with the physics that they were compiled with.
-
-    :param source: the file that all compiled code beside it depends on
-    """
-    changed = source.stat().st_mtime
-    for compiled in (source.parent / "__pycache__").glob("*.nb[ci]"):
-        try:
-            if compiled.stat().st_mtime < changed:
-                compiled.unlink(missing_ok=True)
-        except OSError:  # another process was faster, or the folder is read-only
-            continue
-
-
-drop_stale_cache()
+drop_stale_cache(Path(__file__))
 
 DT = 0.1
 """Time of one step."""
@@ -92,6 +75,19 @@ def clipped(value, limit):
 
 
 @njit(cache=True)
+def all_finite(actions):
+    """
+    Whether no force is infinite or NaN.
+
+    :param actions: (E, n, 2)
+    """
+    finite = True
+    for value in actions.ravel():
+        finite &= math.isfinite(value)
+    return finite
+
+
+@njit(cache=True)
 def contact_force(overlap):
     """
     Size of the force between two touching things: 100 · softplus(overlap / margin) · margin.
@@ -100,6 +96,18 @@ def contact_force(overlap):
     """
     z = overlap / CONTACT_MARGIN
     return CONTACT_FORCE * CONTACT_MARGIN * (max(z, 0.0) + math.log1p(math.exp(-abs(z))))
+
+
+@njit(cache=True)
+def out_of_reach(dx, dy, reach):
+    """
+    Whether two bodies are too far apart to push each other.
+
+    :param dx: x of the one less x of the other
+    :param dy: y of the one less y of the other
+    :param reach: sum of the two radii
+    """
+    return dx * dx + dy * dy > (reach + CONTACT_RANGE) ** 2
 
 
 @njit(cache=True)
@@ -112,10 +120,7 @@ def push_apart(dx, dy, reach):
     :param reach: sum of the two radii
     :return: force along x and y
     """
-    squared = dx * dx + dy * dy
-    if squared > (reach + CONTACT_RANGE) ** 2:
-        return 0.0, 0.0
-    distance = math.sqrt(squared)
+    distance = math.sqrt(dx * dx + dy * dy)
     force = contact_force(reach - distance)
     if distance == 0.0:
         return force, 0.0
@@ -137,11 +142,11 @@ def add_body_contacts(forces, positions, radii, alive):
         if not alive[i]:
             continue
         for j in range(i + 1, n):
-            if not alive[j]:
+            dx, dy = positions[i, 0] - positions[j, 0], positions[i, 1] - positions[j, 1]
+            reach = radii[i] + radii[j]
+            if out_of_reach(dx, dy, reach) or not alive[j]:
                 continue
-            force_x, force_y = push_apart(
-                positions[i, 0] - positions[j, 0], positions[i, 1] - positions[j, 1], radii[i] + radii[j]
-            )
+            force_x, force_y = push_apart(dx, dy, reach)
             forces[i, 0] += force_x
             forces[i, 1] += force_y
             forces[j, 0] -= force_x
@@ -164,9 +169,11 @@ def add_obstacle_contacts(forces, positions, radii, alive, obstacles, obstacle_r
         if not alive[i]:
             continue
         for k in range(obstacles.shape[0]):
-            force_x, force_y = push_apart(
-                positions[i, 0] - obstacles[k, 0], positions[i, 1] - obstacles[k, 1], radii[i] + obstacle_radius
-            )
+            dx, dy = positions[i, 0] - obstacles[k, 0], positions[i, 1] - obstacles[k, 1]
+            reach = radii[i] + obstacle_radius
+            if out_of_reach(dx, dy, reach):
+                continue
+            force_x, force_y = push_apart(dx, dy, reach)
             forces[i, 0] += force_x
             forces[i, 1] += force_y
 

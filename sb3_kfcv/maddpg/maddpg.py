@@ -23,6 +23,7 @@ from sb3_kfcv.common.checks import require_between, require_count, require_finit
 from sb3_kfcv.common.live import shares
 from sb3_kfcv.common.memory import free_memory, in_words
 from sb3_kfcv.common.naming import unknown_name
+from sb3_kfcv.common.noise import OneDraw
 from sb3_kfcv.common.patient_logs import patience
 from sb3_kfcv.common.schedules import schedule_of
 from sb3_kfcv.common.team_policy import TeamPolicy
@@ -448,7 +449,8 @@ class MADDPG(SaveableAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        action, buffer_action = super()._sample_action(learning_starts, action_noise, n_envs)
+        noise = None if action_noise is None else OneDraw(action_noise)
+        action, buffer_action = super()._sample_action(learning_starts, noise, n_envs)
         if self._opponent_policy is not None:  # neither the warm-up nor the noise is for the opponents
             action = self._opponent_policy.fill(action, np.asarray(self._last_obs), deterministic=False)
             buffer_action = self.policy.from_env(action)
@@ -477,7 +479,11 @@ class MADDPG(SaveableAlgorithm):
         if not math.isfinite(reward.sum()):
             rewards = np.array([info["agent_rewards"] for info in infos])
             require_finite_columns("reward", rewards, {name: slice(i, i + 1) for i, name in enumerate(self.layout.agents)})
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
+        if dones.any() or self._vec_normalize_env is not None:
+            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
+        else:  # the same without a copy of all observations, in which the last ones of ended episodes would be put
+            replay_buffer.add(self._last_obs, new_obs, buffer_action, reward, dones, infos)  # type: ignore[arg-type]
+            self._last_original_obs, self._last_obs = self._last_obs, new_obs  # type: ignore[assignment]
 
     def _columns_of(self, slices: Sequence[slice]) -> dict[str, slice]:
         return dict(zip(self.layout.agents, slices, strict=True))

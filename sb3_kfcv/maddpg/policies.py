@@ -584,13 +584,24 @@ class MADDPGPolicy(BasePolicy):
         :return: its action in its own action space, (action,) or (batch, action); choices for discrete agents
         """
         index = self.layout.agents.index(agent)
-        network = self.actor.network(index)
+        place = next((i for i, block in enumerate(self.actor.blocks) if index in block.agents), None)
+        if place is None:
+            raise ValueError(f"{agent!r} is not among the learning agents")
+        stack: StackedMLP = self.actor.stacks[place]  # type: ignore[assignment]
+        member = self.actor.blocks[place].agents.index(index)
         size = self.layout.obs_sizes[index]
         if np.ndim(observation) not in (1, 2) or np.shape(observation)[-1] != size:
             raise ValueError(f"an observation of {agent!r} has {size} values; got an array of shape {np.shape(observation)}")
         rows = th.as_tensor(np.atleast_2d(observation), dtype=th.float32, device=self.device)
         with th.no_grad():
-            output = network(rows)
+            number = member if stack.members is None else int(stack.members[member])
+            network = slice(number, number + 1)  # of the stack, a view
+            output = stack.first(rows.unsqueeze(0), network)  # (1, batch, hidden)
+            if stack.member_bias is not None:
+                output = output + stack.member_bias[member]
+            for layer in stack.rest:
+                output = layer(stack.activation(output), network)
+            output = output.squeeze(0)
         if self.layout.discrete:
             actions = (output if deterministic else gumbel_perturbed(output)).argmax(-1).cpu().numpy()
         else:
