@@ -612,11 +612,12 @@ class MADDPGPolicy(BasePolicy):
         return actions if np.ndim(observation) > 1 else actions[0]
 
     def set_training_mode(self, mode: bool) -> None:
-        if mode == self.training:
-            return
-        self.actor.train(mode)
-        self.critic.train(mode)
-        self.training = mode
+        """Nothing in a stack but an activation (a dropout, say) can depend on it."""
+        if mode != self.training:
+            self.training = mode
+            for network in (self.actor, self.critic):
+                for stack in network.stacks:
+                    stack.activation.train(mode)  # type: ignore[union-attr]
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         data = super()._get_constructor_parameters()
