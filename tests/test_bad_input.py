@@ -48,7 +48,6 @@ def test_more_folds_than_transitions():
         ({"batch_size": 12.5}, r"batch_size.*12\.5"),
         ({"buffer_size": "5000"}, r"buffer_size.*'5000'"),
         ({"batch_size": -1}, r"batch_size.*-1"),
-        ({"optimize_memory_usage": True}, r"optimize_memory_usage"),
     ],
     ids=str,
 )

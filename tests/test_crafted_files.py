@@ -509,13 +509,6 @@ PER = {
     "td_errors fewer": [array(f"{R}/td_errors", lambda errors: errors[1:])],
     "td_errors of floats": [array(f"{R}/td_errors", lambda errors: errors.astype(np.float32))],
     "td_errors a list": [put(R, "td_errors", to=[1.0] * 30)],
-    "ranks twice": [array(f"{R}/by_rank", number(1))],
-    "ranks beyond the last": [array(f"{R}/by_rank", number(1000))],
-    "ranks negative": [array(f"{R}/by_rank", number(-1))],
-    "ranks too many": [array(f"{R}/by_rank", lambda ranks: np.arange(1000))],
-    "ranks of floats": [array(f"{R}/by_rank", lambda ranks: ranks.astype(float))],
-    "ranks in a table": [array(f"{R}/by_rank", lambda ranks: ranks[None])],
-    "draws negative": [put(R, "draws_since_sort", to=-1)],
 }
 DISCRETE = {
     "choices beyond the last": [array(f"{T}/actions", number(4))],

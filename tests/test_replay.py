@@ -9,10 +9,10 @@ from gymnasium import spaces
 from references import assert_equal_trees, fill
 from scipy.stats import chisquare
 
-from sb3_kfcv import KFCVReplayBuffer
+from sb3_kfcv import PERMADDPG, Checkpoints, KFCVReplayBuffer, make_vec_env
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.replay import JointReplayBuffer, PrioritizedReplayBuffer
-from sb3_kfcv.replay.ranks import importance_weights, rank_probabilities
+from sb3_kfcv.replay.ranks import cumulative_masses, importance_weights
 from sb3_kfcv.saving.values import check_writable
 
 LAYOUT = AgentLayout(("a_0", "a_1"), ("a", "a"), (2, 2), (1, 1), state_size=3)
@@ -130,9 +130,13 @@ def test_an_env_without_per_agent_values_is_told_what_to_do():
         make_buffer().add(np.zeros((1, 4)), np.zeros((1, 4)), np.zeros((1, 2)), np.zeros(1), np.zeros(1), [{}])
 
 
-def test_optimize_memory_usage_is_refused():
-    with pytest.raises(ValueError, match="optimize_memory_usage"):
-        make_buffer(optimize_memory_usage=True)
+def test_nothing_depends_on_optimize_memory_usage():
+    """No observation is stored twice, with or without."""
+    buffers = [make_buffer(optimize_memory_usage=wanted) for wanted in (False, True)]
+    for buffer in buffers:
+        fill(buffer, LAYOUT, 10)
+    assert buffers[0].n_bytes == buffers[1].n_bytes
+    assert_equal_trees(buffers[0].transitions(), buffers[1].transitions())
 
 
 # ---- prioritised
@@ -147,19 +151,27 @@ def ranked_buffer(td_errors=(0.1, 4.0, 2.0, 0.5), **kwargs):
     return buffer
 
 
+def probabilities(n, alpha):
+    """P of each rank."""
+    masses = cumulative_masses(n, alpha)
+    return np.diff(masses, prepend=0) / masses[-1]
+
+
 def test_probabilities_of_ranks_by_hand():
-    np.testing.assert_allclose(rank_probabilities(4, 0.7), P_OF_RANKS, atol=1e-5)
+    np.testing.assert_allclose(probabilities(4, 0.7), P_OF_RANKS, atol=1e-5)
 
 
 def test_alpha_zero_is_uniform():
-    np.testing.assert_allclose(rank_probabilities(4, 0.0), [0.25] * 4)
+    np.testing.assert_allclose(probabilities(4, 0.0), [0.25] * 4)
 
 
 def test_the_last_rank_of_many_is_still_drawn():
-    probabilities = rank_probabilities(5000, 0.7)
-    assert probabilities[-1] > 0
-    assert probabilities.sum() == pytest.approx(1)
-    assert (np.diff(probabilities) < 0).all()
+    assert probabilities(5000, 0.7)[-1] > 0
+    assert (np.diff(probabilities(5000, 0.7)) < 0).all()
+
+
+def test_masses_of_fewer_ranks_are_the_first():
+    np.testing.assert_array_equal(cumulative_masses(50, 0.7), cumulative_masses(5000, 0.7)[:50])
 
 
 @pytest.mark.parametrize("batch_size", [1, 4])
@@ -192,7 +204,14 @@ def test_importance_weights_are_full_at_the_end():
 
 
 def test_weights_without_correction_are_one():
-    assert importance_weights(np.array(P_OF_RANKS), 4, P_OF_RANKS[-1], beta=0.0).tolist() == [1] * 4
+    assert importance_weights(np.arange(1, 5), 4, 0.7, beta=0.0).tolist() == [1] * 4
+
+
+@pytest.mark.parametrize("beta", [0.5, 1.0])
+def test_weights_are_those_of_the_probabilities(beta):
+    """(n·P)^−β over the largest."""
+    weights = (5000 * probabilities(5000, 0.7)) ** -beta
+    np.testing.assert_allclose(importance_weights(np.arange(1, 5001), 5000, 0.7, beta), weights / weights.max(), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("progress", "beta"), [(0.0, 0.5), (0.5, 0.75), (1.0, 1.0)])
@@ -222,14 +241,19 @@ def test_every_transition_keeps_a_chance():
     assert (shares(ranked_buffer(td_errors=(0.0, 1e9, 1e9, 1e9))) > 0.1).all()
 
 
-def test_a_large_buffer_is_sorted_now_and_then():
-    """Above ``sort_above`` transitions the order of the last sort serves ``sort_every`` draws."""
-    buffer = ranked_buffer(sort_above=3, sort_every=5)
-    assert shares(buffer)[1] == pytest.approx(P_OF_RANKS[0], abs=0.005)
-    buffer.update_priorities(np.array([1]), th.tensor([0.01]))
-    for _ in range(5):
-        last = shares(buffer)
-    assert last[1] == pytest.approx(P_OF_RANKS[3], abs=0.005)
+def test_a_large_buffer_is_ranked_exactly_at_each_draw():
+    """By the rows drawn, which are those of a stable sort of all |δ|, new transitions first."""
+    buffer, rng = make_buffer(PrioritizedReplayBuffer, size=3000, n_envs=2), np.random.default_rng(0)
+    fill(buffer, LAYOUT, 1400)
+    masses = cumulative_masses(3000, 0.7)
+    for i in range(40):
+        n = buffer.n_rows
+        batch = buffer.sample(64)
+        points = (np.arange(64) + rng.random(64)) / 64 * masses[n - 1]
+        places = np.searchsorted(masses[:n], points)
+        np.testing.assert_array_equal(batch.rows, np.argsort(-buffer.td_errors[:n], kind="stable")[places])
+        buffer.update_priorities(batch.rows, batch.rewards.abs().mean(1).round(decimals=1))
+        fill(buffer, LAYOUT, 7, seed=i)
 
 
 @pytest.mark.parametrize("kwargs", [{"alpha": -0.1}, {"beta_init": 1.5}, {"beta_init": -0.1}])
@@ -265,7 +289,6 @@ KFCV = {"n_folds": 3, "teacher_batch_size": 8, "teacher_steps": 3, "first_teache
 BUFFERS = {
     "uniform": (JointReplayBuffer, {}),
     "prioritised": (PrioritizedReplayBuffer, {}),
-    "prioritised, large": (PrioritizedReplayBuffer, {"sort_above": 10, "sort_every": 7}),
     "curriculum": (KFCVReplayBuffer, KFCV),
 }
 
@@ -333,6 +356,30 @@ def test_the_latest_transitions_move_to_a_buffer_of_another_shape(name, size, n_
             for row, value in zip(by_row(moved), getattr(moved, noted), strict=False):
                 assert of[row.tobytes()] == value, noted
     use(moved)
+
+
+def test_an_order_of_the_priorities_in_a_file_is_not_needed():
+    """It follows from |δ|: files may hold it."""
+    saved, restored = used_buffer("prioritised", 40), used_buffer("prioritised", 40, seed=7)
+    state = deepcopy({**saved.state(), "by_rank": np.arange(40)[::-1], "draws_since_sort": 3})
+    restored.set_state(state, saved.transitions())
+    np.testing.assert_array_equal(use(saved), use(restored))
+
+
+def test_models_and_checkpoints_may_name_settings_that_are_no_more(tmp_path):
+    """Files of format 1 may say how often the ranks were refreshed."""
+
+    def make():
+        env = make_vec_env("HardSpread-v0", 2, seed=0, env_kwargs={"n_agents": 2, "max_steps": 8})
+        small = {"learning_starts": 10, "batch_size": 8, "buffer_size": 24, "policy_kwargs": {"net_arch": [4]}}
+        return PERMADDPG("MlpPolicy", env, seed=0, device="cpu", replay_buffer_kwargs={"alpha": 0.5}, **small)
+
+    model = make()
+    model.replay_buffer_kwargs = {"alpha": 0.5, "sort_above": 10, "sort_every": 7}
+    model.learn(40, Checkpoints(tmp_path, save_freq=40))
+    loaded = PERMADDPG.load(tmp_path / "rl_model_40_steps.zip", make().get_env())
+    assert (loaded.replay_buffer_kwargs, loaded.replay_buffer.alpha) == ({"alpha": 0.5}, 0.5)
+    assert make().learn(60, Checkpoints(tmp_path, save_freq=40, resume=True)).num_timesteps == 60
 
 
 def test_transitions_are_given_from_a_step_on():

@@ -305,9 +305,6 @@ SETUPS = {
     "trained every seven steps": lambda: small(PERMADDPG, grassland(), train_freq=(7, "step"), gradient_steps=-1),
     "random stages": lambda: small(KFCVMADDPG, grassland(), replay_buffer_kwargs={"stage_rule": "random"}),
     "the student's scores": lambda: small(KFCVMADDPG, grassland(), replay_buffer_kwargs={"score": "student"}),
-    "priorities sorted now and then": lambda: small(
-        PERMADDPG, grassland(), replay_buffer_kwargs={"sort_above": 10, "sort_every": 7}
-    ),
     "buffer smaller than the way between checkpoints": lambda: small(PERMADDPG, grassland(), buffer_size=24),
     "buffer that wraps": lambda: small(KFCVMADDPG, grassland(), buffer_size=50),
     "ParallelEnv": lambda: small(MADDPG, grassland_v0.parallel_env(**GRASSLAND)),

@@ -70,7 +70,7 @@ class MADDPG(SaveableAlgorithm):
     :param exploration_noise: standard deviation of the default noise; discrete agents draw from their softmax instead
     :param replay_buffer_class: by default the one of the algorithm
     :param replay_buffer_kwargs: settings of the replay buffer
-    :param optimize_memory_usage: not supported
+    :param optimize_memory_usage: nothing depends on it: the replay buffer never stores an observation twice
     :param critic_input: what critics see beside all actions: ``"observations"`` (all agents', as in the paper), ``"state"``
         (the world's ``state()``) or ``"own_observation"`` (the agent's own); the latter two make the critics' first layer
         many times smaller, and lose nothing where every agent sees the whole world

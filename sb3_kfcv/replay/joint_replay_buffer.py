@@ -13,9 +13,16 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_kfcv.common.checks import require_between, require_count, require_finite
 from sb3_kfcv.common.memory import require_memory
+from sb3_kfcv.replay.successors import Successors, gather, room_apart
 
-# The arrays of stored transitions: (steps, n_envs, …).
+# What a transition is made of: arrays (steps, n_envs, …).
 TRANSITION_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "alive", "states", "next_states")
+
+# Those that are mostly what the next step starts from, and what that is.
+FOLLOWING = {"next_observations": "observations", "next_states": "states"}
+
+# Share of the transitions for whose ends of episodes there is room at first: of episodes of 20 steps or more.
+SHARE_OF_ENDS = 0.05
 
 
 class JointReplayBufferSamples(NamedTuple):
@@ -35,6 +42,26 @@ class JointReplayBufferSamples(NamedTuple):
     weights: th.Tensor  # (batch,): importance weights of the critic loss
     rows: np.ndarray  # (batch,): where the transitions lie in the buffer
     discounts: th.Tensor | None = None
+
+
+class Minibatch:
+    """
+    Tensors for a minibatch, (batch, …) each, and their memory as arrays.
+
+    :param size: batch
+    :param widths: name → columns
+    """
+
+    def __init__(self, size: int, widths: dict[str, int]) -> None:
+        self.size, self.widths = size, widths
+        self.tensors = {name: th.empty(size, width) for name, width in widths.items()}
+        self.arrays = {name: self.tensors[name].numpy() for name, width in widths.items() if width}
+        self.tensors["weights"] = th.ones(size)
+        self.weights = self.tensors["weights"].numpy()
+
+    def __reduce__(self) -> tuple[type[Minibatch], tuple[int, dict[str, int]]]:
+        """A copy is another empty one: its arrays must be the memory of its own tensors."""
+        return Minibatch, (self.size, self.widths)
 
 
 class Student(Protocol):
@@ -64,22 +91,22 @@ class JointReplayBuffer(ReplayBuffer):
     ``state``/``next_state`` where states are stored). A row of the buffer is one (time, env) pair, numbered
     ``time * n_envs + env``: the order in which rows fill.
 
+    What a step leads to is what the next step of its world starts from, and stored once; only the ends of episodes are kept
+    apart. :meth:`estimate_bytes` tells what a buffer will take, :attr:`n_bytes` what it takes.
+
     :param buffer_size: number of joint transitions in all
     :param observation_space: joint observation space
     :param action_space: joint action space
     :param device: where samples go
     :param n_envs: number of worlds that fill it
-    :param optimize_memory_usage: not supported (next observations are stored, so that time limits bootstrap)
+    :param optimize_memory_usage: nothing depends on it: no observation is ever stored twice, and time limits bootstrap
     :param n_agents: number of agents of the world
     :param state_size: length of the world states to store; 0 stores none
     :param seed: of the sampling; ``None`` takes fresh entropy
     """
 
     uses_td_errors: ClassVar[bool] = False  # whether update_priorities() wants to be called
-
-    alive: np.ndarray
-    states: np.ndarray
-    next_states: np.ndarray
+    noted_bytes: ClassVar[int] = 0  # per transition, of what a kind of replay notes of each
 
     def __init__(
         self,
@@ -93,23 +120,74 @@ class JointReplayBuffer(ReplayBuffer):
         state_size: int = 0,
         seed: int | None = None,
     ) -> None:
-        if optimize_memory_usage:
-            raise ValueError("optimize_memory_usage=True is not supported: time limits need the stored next observation")
-        self.n_bytes = n_bytes(buffer_size, observation_space, action_space, n_envs, n_agents, state_size)
-        require_memory(f"a replay buffer of {buffer_size:,} joint transitions", self.n_bytes)
-        super().__init__(buffer_size, observation_space, action_space, device, n_envs)
+        n_bytes = self.estimate_bytes(buffer_size, observation_space, action_space, n_envs, n_agents, state_size)
+        require_memory(f"a replay buffer of {buffer_size:,} joint transitions", n_bytes)
+        super().__init__(
+            *(buffer_size, observation_space, action_space, device, n_envs),
+            optimize_memory_usage=True,
+            handle_timeout_termination=False,
+        )
         del self.timeouts  # time limits are told from deaths per agent, see ``agent_terminated``
         shape = (self.buffer_size, self.n_envs)
         self.rewards = np.zeros((*shape, n_agents), dtype=np.float32)
         self.dones = np.zeros((*shape, n_agents), dtype=np.float32)
         self.alive = np.zeros((*shape, n_agents), dtype=np.float32)
         self.states = np.zeros((*shape, state_size), dtype=np.float32)
-        self.next_states = np.zeros((*shape, state_size), dtype=np.float32)
+        self._successors = Successors(self.observations, self.states, SHARE_OF_ENDS)
         self.rng = np.random.default_rng(seed)
         self.n_added = 0  # steps (of all worlds) ever stored
         self.progress = 0.0  # share of training done, in [0, 1]; set by the learner
         self.normalizer: VecNormalize | None = None
         self._minibatch = self._empty(0)
+
+    @classmethod
+    def estimate_bytes(
+        cls,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        n_envs: int = 1,
+        n_agents: int = 1,
+        state_size: int = 0,
+        share_of_ends: float = SHARE_OF_ENDS,
+    ) -> int:
+        """
+        Memory that the arrays of such a buffer take, beside its minibatch.
+
+        :param share_of_ends: share of the transitions that an episode ends with, 1 / its length; up to the default there
+            is room from the start, beyond it the buffer grows while it fills (1: as if every next observation were stored)
+
+        The other parameters are those of the buffer.
+        """
+        n_steps = max(buffer_size // n_envs, 1)
+        seen = get_flattened_obs_dim(observation_space) * np.dtype(observation_space.dtype).itemsize + 4 * state_size
+        action = get_action_dim(action_space) * np.dtype(action_space.dtype).itemsize
+        place = 4
+        apart = room_apart(n_steps, n_envs, max(share_of_ends, SHARE_OF_ENDS))
+        per_row = seen + action + 3 * 4 * n_agents + place + cls.noted_bytes
+        return n_steps * n_envs * per_row + apart * seen + (apart - n_envs) * place
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory that its arrays take, beside the minibatch."""
+        return sum(array.nbytes for array in vars(self).values() if isinstance(array, np.ndarray)) + self._successors.n_bytes
+
+    @property
+    def next_observations(self) -> np.ndarray:  # type: ignore[override]
+        """What the steps led to, (steps, n_envs, …), put together anew at each call."""
+        return self._following("next_observations")
+
+    @property
+    def next_states(self) -> np.ndarray:
+        """The states that the steps led to, (steps, n_envs, …), put together anew at each call."""
+        return self._following("next_states")
+
+    def _following(self, name: str) -> np.ndarray:
+        starts = getattr(self, FOLLOWING[name])
+        found = np.zeros_like(starts)
+        rows = np.arange(self.n_rows)
+        self._successors.read(name, rows, found.reshape(-1, starts.shape[2])[: len(rows)])
+        return found
 
     @property
     def n_rows(self) -> int:
@@ -120,6 +198,7 @@ class JointReplayBuffer(ReplayBuffer):
         """Forget all transitions."""
         super().reset()
         self.n_added = 0
+        self._successors.reset()
 
     def attach(self, student: Student) -> None:
         """Meet the learner. Uniform replay asks nothing of it."""
@@ -143,13 +222,15 @@ class JointReplayBuffer(ReplayBuffer):
             self.rewards[pos] = [info["agent_rewards"] for info in infos]
             self.dones[pos] = [info["agent_terminated"] for info in infos]
             self.alive[pos] = [info["agent_alive"] for info in infos]
-            if self.states.shape[-1]:
+            following: dict[str, Any] = {"next_observations": next_obs}
+            if self.states.shape[2]:
                 self.states[pos] = [info["state"] for info in infos]
-                self.next_states[pos] = [info["next_state"] for info in infos]
+                following["next_states"] = [info["next_state"] for info in infos]
         except KeyError as missing:
             raise ValueError(f"the env's infos lack {missing}; wrap a PettingZoo parallel env in JointEnv") from None
         self.observations[pos] = obs
-        self.next_observations[pos] = next_obs
+        previous = (pos - 1) % self.buffer_size if self.n_added and self.buffer_size > 1 else None
+        self._successors.add(pos, previous, following)
         self.actions[pos] = np.reshape(action, (self.n_envs, self.action_dim))
         self.n_added += 1
         self.pos = self.n_added % self.buffer_size
@@ -164,7 +245,7 @@ class JointReplayBuffer(ReplayBuffer):
         """
         self.normalizer = env
         rows, weights = self._draw(batch_size)
-        if len(self._minibatch["rewards"]) != batch_size:
+        if self._minibatch.size != batch_size:
             self._minibatch = self._empty(batch_size)
         return self._gather(rows, weights, self._minibatch)
 
@@ -178,32 +259,39 @@ class JointReplayBuffer(ReplayBuffer):
 
         :param rows: (batch,) row numbers
         :param weights: (batch,) importance weights
+        :raises IndexError: if there is no such row
         """
+        if not (0 <= rows.min(initial=0) and rows.max(initial=0) < max(self.n_rows, 1)):
+            raise IndexError(f"rows {rows.min()} to {rows.max()} of a buffer that holds {self.n_rows}")
         return self._gather(rows, weights, self._empty(len(rows)))
 
-    def _empty(self, batch_size: int) -> dict[str, th.Tensor]:
-        """Tensors for a minibatch: (batch, …) each."""
-        widths = {name: getattr(self, name).shape[-1] for name in TRANSITION_ARRAYS}
-        tensors = {name: th.empty(batch_size, width) for name, width in widths.items()}
-        return {**tensors, "weights": th.ones(batch_size)}
+    def _empty(self, batch_size: int) -> Minibatch:
+        return Minibatch(batch_size, {name: self._stored(name).shape[2] for name in TRANSITION_ARRAYS})
 
-    def _gather(self, rows: np.ndarray, weights: np.ndarray | None, into: dict[str, th.Tensor]) -> JointReplayBufferSamples:
-        """The rows, written into tensors of :meth:`_empty`."""
-        index = th.from_numpy(rows)
-        n_rows = self.buffer_size * self.n_envs
-        for name in TRANSITION_ARRAYS:
-            if not into[name].shape[1]:  # no states are stored
-                continue
-            stored = th.from_numpy(getattr(self, name)).view(n_rows, -1)
-            if stored.dtype == th.float32:
-                th.index_select(stored, 0, index, out=into[name])
-            else:  # the choices of discrete agents
-                into[name].copy_(stored[index])
-            if self.normalizer is not None and name in ("observations", "next_observations"):
-                into[name].copy_(th.as_tensor(self.normalizer.normalize_obs(into[name].numpy())))  # type: ignore[arg-type]
+    def _gather(self, rows: np.ndarray, weights: np.ndarray | None, into: Minibatch) -> JointReplayBufferSamples:
+        """The rows, written into a minibatch."""
+        for name, array in into.arrays.items():
+            self._read(name, rows, array)
+        if self.normalizer is not None:
+            for name in ("observations", "next_observations"):
+                into.arrays[name][:] = self.normalizer.normalize_obs(into.arrays[name])
         if weights is not None:
-            into["weights"].copy_(th.from_numpy(weights))
-        return JointReplayBufferSamples(**{name: tensor.to(self.device) for name, tensor in into.items()}, rows=rows)
+            into.weights[:] = weights
+        tensors = into.tensors
+        if self.device.type != "cpu":
+            tensors = {name: tensor.to(self.device) for name, tensor in tensors.items()}
+        return JointReplayBufferSamples(**tensors, rows=rows)
+
+    def _stored(self, name: str) -> np.ndarray:
+        """The array, (steps, n_envs, …), of a transition's part; of what follows, that of what it mostly is."""
+        return getattr(self, FOLLOWING.get(name, name))
+
+    def _read(self, name: str, rows: np.ndarray, into: np.ndarray) -> None:
+        """Write one part of the rows' transitions into an array (rows, …)."""
+        if name in FOLLOWING:
+            self._successors.read(name, rows, into)
+        else:
+            gather(getattr(self, name), rows, into)
 
     def update_priorities(self, rows: np.ndarray, td_errors: th.Tensor) -> None:
         """
@@ -235,7 +323,14 @@ class JointReplayBuffer(ReplayBuffer):
         :return: name → (steps, n_envs, …)
         """
         slots = np.arange(max(first, self.n_added - self.size()), self.n_added) % self.buffer_size
-        return {name: getattr(self, name)[slots] for name in TRANSITION_ARRAYS}
+        rows = (slots[:, None] * self.n_envs + np.arange(self.n_envs)).ravel()
+        given = {}
+        for name in TRANSITION_ARRAYS:
+            stored = self._stored(name)
+            read = np.empty((len(rows), stored.shape[2]), dtype=stored.dtype)
+            self._read(name, rows, read)
+            given[name] = read.reshape(len(slots), *stored.shape[1:])
+        return given
 
     def set_state(self, state: dict[str, Any], transitions: dict[str, np.ndarray]) -> None:
         """
@@ -266,10 +361,14 @@ class JointReplayBuffer(ReplayBuffer):
         self._set_bookkeeping(state, rows, (slots[:, None] * self.n_envs + np.arange(self.n_envs)).ravel())
         self.rng.bit_generator.state = state["rng"]
         self.progress = state["progress"]
+        latest = {
+            name: array.reshape(n_rows, array.shape[2])[n_rows - len(rows) :].reshape(held, self.n_envs, array.shape[2])
+            for name, array in transitions.items()
+        }
         for name in TRANSITION_ARRAYS:
-            own = getattr(self, name)
-            latest = transitions[name].reshape(n_rows, own.shape[-1])[n_rows - len(rows) :]
-            own[slots] = latest.reshape(held, *own.shape[1:])
+            if name not in FOLLOWING:
+                getattr(self, name)[slots] = latest[name]
+        self._successors.set(slots, {name: latest[name] for name in FOLLOWING})
         self.n_added, self.pos, self.full = n_added, n_added % self.buffer_size, n_added >= self.buffer_size
 
     def _set_bookkeeping(self, state: dict[str, Any], rows: np.ndarray, own_rows: np.ndarray) -> None:
@@ -289,11 +388,12 @@ class JointReplayBuffer(ReplayBuffer):
         if set(transitions) != set(TRANSITION_ARRAYS):
             raise ValueError(f"not a replay buffer of this model: it has {', '.join(transitions)}")
         for name, array in transitions.items():
-            expected = (held, n_envs, *getattr(self, name).shape[2:])
-            if array.shape != expected or array.dtype != getattr(self, name).dtype:
+            own = self._stored(name)
+            expected = (held, n_envs, *own.shape[2:])
+            if array.shape != expected or array.dtype != own.dtype:
                 raise ValueError(
                     f"not a replay buffer of this model: {name} is {array.shape} of {array.dtype}, wanted is {expected} "
-                    f"of {getattr(self, name).dtype}"
+                    f"of {own.dtype}"
                 )
             require_finite(f"{name} of the replay buffer", array)
         for name in ("dones", "alive"):
@@ -303,13 +403,3 @@ class JointReplayBuffer(ReplayBuffer):
             choices = transitions["actions"]
             if not ((choices >= 0) & (choices < self.action_space.nvec)).all():
                 raise ValueError(f"not a replay buffer of this model: actions are choices among {self.action_space.nvec}")
-
-
-def n_bytes(
-    buffer_size: int, observation_space: spaces.Space, action_space: spaces.Space, n_envs: int, n_agents: int, state_size: int
-) -> int:
-    """Memory that the transitions of a :class:`JointReplayBuffer` take; its parameters."""
-    numbers = 2 * get_flattened_obs_dim(observation_space) + get_action_dim(action_space) + 3 * n_agents + 2 * state_size
-    itemsize = 4 if isinstance(action_space, spaces.Box) else 8
-    other = (itemsize - 4) * get_action_dim(action_space)
-    return max(buffer_size // n_envs, 1) * n_envs * (4 * numbers + other)

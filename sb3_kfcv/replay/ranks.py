@@ -5,39 +5,39 @@ from __future__ import annotations
 import numpy as np
 
 
-def rank_probabilities(n: int, alpha: float) -> np.ndarray:
+def cumulative_masses(n: int, alpha: float) -> np.ndarray:
     """
-    P of rank 1 … n: p = 1/rank (eq. 4), P = p^α / Σ p^α (eq. 3).
+    p^α of rank 1 … n with p = 1/rank (eq. 4), added up. Of n transitions the rank k is drawn with P(k) = k^−α / Σ p^α (eq. 3),
+    and the sum over the first n ranks is the n-th of these, however many follow.
 
-    :param n: number of transitions
+    :param n: number of ranks
     :param alpha: degree of prioritisation; 0 is uniform
-    :return: (n,) probabilities, falling, all positive, of sum one
+    :return: (n,) rising
     """
-    mass = np.arange(1, n + 1, dtype=np.float64) ** -alpha
-    return mass / mass.sum()
+    return np.cumsum(np.arange(1, n + 1, dtype=np.float64) ** -alpha)
 
 
-def importance_weights(probabilities: np.ndarray, n: int, smallest: float, beta: float) -> np.ndarray:
+def importance_weights(ranks: np.ndarray, n: int, alpha: float, beta: float) -> np.ndarray:
     """
-    (n·P)^−β, divided by the largest weight in the buffer.
+    (n·P)^−β, divided by the largest weight in the buffer, that of the last rank: (P(rank) / P(n))^−β = (rank / n)^(α β).
 
-    :param probabilities: (batch,) P of the drawn transitions
+    :param ranks: (batch,) ranks of the drawn transitions, 1 … n
     :param n: number of transitions in the buffer
-    :param smallest: smallest P in the buffer, whose weight is the largest
+    :param alpha: degree of prioritisation
     :param beta: degree of correction; 1 is full
     :return: (batch,) weights in (0, 1]
     """
-    return (n * probabilities) ** -beta / (n * smallest) ** -beta
+    return (ranks / n) ** (alpha * beta)
 
 
 def stratified(cumulative: np.ndarray, size: int, rng: np.random.Generator) -> np.ndarray:
     """
     ``size`` draws, one from each of ``size`` segments of equal probability mass.
 
-    :param cumulative: (n,) cumulative probabilities
+    :param cumulative: (n,) cumulative masses
     :param size: number of draws
     :param rng: generator
-    :return: (size,) indices into ``cumulative``
+    :return: (size,) indices into ``cumulative``, rising
     """
-    points = (np.arange(size) + rng.random(size)) / size
+    points = (np.arange(size) + rng.random(size)) * (cumulative[-1] / size)
     return np.minimum(np.searchsorted(cumulative, points, side="right"), len(cumulative) - 1)

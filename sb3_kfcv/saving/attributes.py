@@ -26,6 +26,9 @@ OF_THE_PROGRAM = ("env", "_vec_normalize_env", "replay_buffer", "device", "_logg
 # Settings of policy and replay buffer that follow from the model's own.
 OF_THE_ALGORITHM = ("layout", "agents", "n_agents", "state_size")
 
+# Settings of the replay buffer that a file may name and that nothing depends on.
+RETIRED_SETTINGS = ("sort_above", "sort_every")
+
 COUNTERS = ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates", "_stats_window_size")
 
 
@@ -56,6 +59,18 @@ def check_attributes(attributes: dict[str, Any], algorithm: type) -> None:
             raise ValueError(f"{name} must be an array of {shape}, or nothing")
     for name in ("ep_info_buffer", "ep_success_buffer", "_episode_metrics"):
         _check_episodes(name, deque() if attributes.get(name) is None else attributes[name])
+
+
+def without_retired(attributes: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param attributes: of a model, from a file
+    :return: the same without the settings of the replay buffer that are no more
+    """
+    settings = attributes.get("replay_buffer_kwargs") if isinstance(attributes, dict) else None
+    if not isinstance(settings, dict):
+        return attributes
+    kept = {name: value for name, value in settings.items() if name not in RETIRED_SETTINGS}
+    return {**attributes, "replay_buffer_kwargs": kept}
 
 
 def _check_spaces(layout: Any, observations: Any, actions: Any) -> None:

@@ -23,7 +23,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.saving.archive import Archive, FileFormatError, open_archive, write_archive
-from sb3_kfcv.saving.attributes import check_attributes
+from sb3_kfcv.saving.attributes import check_attributes, without_retired
 from sb3_kfcv.saving.files import going_on
 from sb3_kfcv.saving.run_state import (
     UnreadableEnvError,
@@ -103,7 +103,7 @@ class Checkpoint:
     def __init__(self, path: Path) -> None:
         self.path = path
         with open_archive(path, "checkpoint") as archive:
-            self.attributes: dict[str, Any] = archive.read("attributes")
+            self.attributes: dict[str, Any] = without_retired(archive.read("attributes"))
             self.parameters: dict[str, Any] = archive.read("parameters")
             self.replay_buffer: dict[str, Any] = archive.read("replay_buffer")
             self.training: dict[str, Any] = archive.read("training")

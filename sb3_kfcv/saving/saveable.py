@@ -21,7 +21,7 @@ from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.stacked_networks import at_most
 from sb3_kfcv.replay.joint_replay_buffer import JointReplayBuffer
 from sb3_kfcv.saving.archive import Archive, FileFormatError, Source, open_archive, write_archive
-from sb3_kfcv.saving.attributes import NEEDED, check_attributes
+from sb3_kfcv.saving.attributes import NEEDED, check_attributes, without_retired
 from sb3_kfcv.saving.files import with_suffix
 from sb3_kfcv.saving.normalization import normalization_state
 from sb3_kfcv.saving.parameters import check_network, check_optimizer
@@ -158,7 +158,8 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
                 get_system_info()
                 print("saved with:", archive.manifest.get("libraries"))
             with refusals(archive, "attributes"):
-                attributes = {**archive.read("attributes", without=tuple(custom_objects or ())), **(custom_objects or {})}
+                own = without_retired(archive.read("attributes", without=tuple(custom_objects or ())))
+                attributes = {**own, **(custom_objects or {})}
                 if not attributes.keys() >= NEEDED:
                     raise ValueError("they are not those of a model")
                 algorithm = attributes.pop("algorithm")
