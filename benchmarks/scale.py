@@ -39,7 +39,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for ``zoo``
 
 from sb3_kfcv import KFCVMADDPG, MADDPG, PERMADDPG, make_vec_env
 from sb3_kfcv.maddpg.policies import CRITIC_INPUTS
-from sb3_kfcv.replay.joint_replay_buffer import n_bytes as estimated_bytes
 from sb3_kfcv.saving.files import atomic_write
 from sb3_kfcv.vec_env.make import WORLDS, make_worlds
 from zoo.plots import new_figure, save_figure
@@ -288,22 +287,21 @@ def vec_env_seconds(effort: Effort, world: str, n_worlds: int) -> list[float]:
 def memory(effort: Effort) -> Iterator[Curve]:
     """A full buffer: what the library says before it makes one, and what a process grows by as one is filled."""
     panel = "4 agents, observations 8"
-    estimated = Curve("memory", panel, "estimated", "transitions held", "B", "buffer")
-    curves = {name: Curve("memory", panel, f"{name}, measured", estimated.size, "B", "buffer") for name in ALGORITHMS}
-    for size in effort.weighed:
-        if (n_bytes := bytes_of(*SMALL, size)) > LARGEST:
-            for curve in (estimated, *curves.values()):
-                curve.left_out[str(size)] = too_large(n_bytes)
-        else:
-            estimated.add(size, [float(n_bytes)])
-    command = [sys.executable, __file__, "--grow", *map(str, estimated.sizes)]
-    printed = [subprocess.check_output(command, text=True) for _ in range(effort.processes if estimated.sizes else 0)]
+    estimated = {name: Curve("memory", panel, f"{name}, estimated", "transitions held", "B", "buffer") for name in ALGORITHMS}
+    curves = {name: Curve("memory", panel, f"{name}, measured", "transitions held", "B", "buffer") for name in ALGORITHMS}
+    sizes = [size for size in effort.weighed if bytes_of(*SMALL, size) <= LARGEST]
+    for curve in (*estimated.values(), *curves.values()):
+        curve.left_out = {str(size): too_large(bytes_of(*SMALL, size)) for size in effort.weighed if size not in sizes}
+    command = [sys.executable, __file__, "--grow", *map(str, sizes)]
+    printed = [subprocess.check_output(command, text=True) for _ in range(effort.processes if sizes else 0)]
     grown = [json.loads(text.splitlines()[-1]) for text in printed]
-    for name, curve in curves.items():
-        for i, size in enumerate(estimated.sizes):
-            curve.add(size, [float(growth[name][i]) for growth in grown])
-    yield estimated
-    yield from curves.values()
+    for name, algorithm in ALGORITHMS.items():
+        for i, size in enumerate(sizes):
+            estimated[name].add(size, [float(bytes_of(*SMALL, size, algorithm))])
+            curves[name].add(size, [float(growth[name][i]) for growth in grown])
+    for name in ALGORITHMS:
+        yield estimated[name]
+        yield curves[name]
 
 
 def grow(sizes: Sequence[int]) -> dict[str, list[int]]:
@@ -330,10 +328,11 @@ def grow(sizes: Sequence[int]) -> dict[str, list[int]]:
     return grown
 
 
-def bytes_of(n_agents: int, obs_size: int, action_size: int, n_rows: int) -> int:
+def bytes_of(n_agents: int, obs_size: int, action_size: int, n_rows: int, algorithm: type[MADDPG] = MADDPG) -> int:
     """What the library says a buffer will take."""
     world = RandomWorld(n_agents, obs_size, action_size, 0)
-    return estimated_bytes(n_rows, world.observation_space, world.action_space, N_ENVS, n_agents, 0)
+    estimate = algorithm.default_buffer_class.estimate_bytes
+    return estimate(n_rows, world.observation_space, world.action_space, N_ENVS, n_agents)
 
 
 def too_large(n_bytes: int) -> str:

@@ -283,11 +283,7 @@ def test_the_memory_of_a_buffer_is_told_before_and_after(kind, size, n_envs, sta
     kwargs = {"n_folds": 2} if kind == "curriculum" else {}
     buffer = KINDS[kind](size, OBS, action_space, device="cpu", **settings, **kwargs)
     assert buffer.n_bytes == real_bytes(buffer)
-    noted = 0
-    if kind == "curriculum":
-        noted = sum(array.nbytes for array in (buffer.folds, buffer.scores, buffer.buckets))
-        noted -= KFCVReplayBuffer.noted_bytes * len(buffer.folds)
-    assert buffer.n_bytes == KINDS[kind].estimate_bytes(size, OBS, action_space, **settings) + noted
+    assert buffer.n_bytes == KINDS[kind].estimate_bytes(size, OBS, action_space, **settings)
 
 
 def test_episodes_of_twenty_steps_need_no_more_room():

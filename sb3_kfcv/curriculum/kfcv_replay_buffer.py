@@ -6,7 +6,7 @@ import math
 import time
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -79,6 +79,8 @@ class KFCVReplayBuffer(JointReplayBuffer):
 
     The other parameters are those of :class:`~sb3_kfcv.replay.JointReplayBuffer`.
     """
+
+    noted_bytes: ClassVar[int] = 3 * 8 + 4  # fold, score and its age, bucket
 
     def __init__(
         self,
@@ -255,7 +257,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
         if not all(len(places) for places in members):
             return
         weights = th.as_tensor(stratum_weights(known, rows), device=self.device)
-        inputs, targets, live = self._read(rows)
+        inputs, targets, live = self._assessed(rows)
         compared = slice(None, None, 1 if self.score == "student" else -(-len(rows) // COMPARED))
         student_errors = (targets[:, compared] - self._student_values(rows[compared])).square()
         if self.score == "student":
@@ -276,7 +278,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
         self.n_refreshes += 1
         self._refresh_seconds += time.perf_counter() - start
 
-    def _read(self, rows: np.ndarray) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    def _assessed(self, rows: np.ndarray) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """Teacher inputs (n, features); TD targets, and 1 where the agent lived, (agents, n)."""
         student = self.student
         inputs = th.empty(len(rows), student.teacher_input_size, device=self.device)
