@@ -614,14 +614,14 @@ def incremental(**kwargs):
     kwargs = {"size": 200, "refresh_every": 4, "scored_per_update": 10, **kwargs}
     buffer = make_buffer(**kwargs)
     worked_on = []
-    read = buffer._read
+    read = buffer._assessed
 
     def spied(rows):
         found = read(rows)
         worked_on.append(set(serials(found[0]).tolist()))
         return found
 
-    buffer._read = spied
+    buffer._assessed = spied
     return buffer, worked_on
 
 
