@@ -203,7 +203,7 @@ class StackedMLP(nn.Module):
 
     def first_layer_rows(self, members: Sequence[int], columns: th.Tensor) -> th.Tensor:
         """
-        Where some inputs' weights stand in the first layer, for :meth:`first_layer_weights`.
+        Where some inputs' weights stand in the first layer seen as rows, ``first.weight.view(-1, hidden)``.
 
         :param members: numbers of the members
         :param columns: (len(members), k) positions in the input
@@ -219,15 +219,6 @@ class StackedMLP(nn.Module):
         if self.common_input:
             return columns * self.n_networks + networks[:, None]
         return networks[:, None] * self.sizes[0] + columns
-
-    @th.no_grad()
-    def first_layer_weights(self, rows: th.Tensor) -> th.Tensor:
-        """
-        :param rows: (m, k), see :meth:`first_layer_rows`
-        :return: (m, k, hidden)
-        """
-        width = self.sizes[1]
-        return self.first.weight.view(-1, width).index_select(0, rows.flatten()).view(*rows.shape, width)
 
     def gradient_norms(self) -> th.Tensor:
         """Euclidean norm of each network's gradient: (networks,)."""
@@ -268,7 +259,7 @@ class StackedMLP(nn.Module):
         first_bias = self.first.bias.view(-1, self.sizes[1])[net]
         if self.member_bias is not None:
             first_bias = first_bias + self.member_bias[index, 0]
-        weights = [(self.first_layer_weights(everything)[0], first_bias)]
+        weights = [(self.first.weight.view(-1, self.sizes[1])[everything[0]], first_bias)]
         weights += [(layer.weight[net], layer.bias[net, 0]) for layer in self.rest]  # type: ignore[index]
         layers: list[nn.Module] = []
         for weight, bias in weights:
@@ -302,6 +293,10 @@ class Evaluation:
         self.transposed = [weight.transpose(1, 2) for weight, _ in self.weights]
         self.first, self.first_bias = stack.first.weight.detach(), stack.first.bias.detach()
         self.pointer = self.first.data_ptr()
+        self.by_row = self.first.view(-1, self.width)
+        self.common = None  # weight and bias of a common input, where they stand side by side
+        if stack.common_input and self.wide_rows is None:
+            self.common = stack.side_by_side(self.first, self.first_bias)
         self.member_bias = None if stack.member_bias is None else stack.member_bias.detach()
         self.x = self.first  # the input, once there is one
         self.graphs: list[tuple[th.Tensor, th.Tensor]] = []  # of activations other than ReLU: what went in and what came out
@@ -335,7 +330,7 @@ class Evaluation:
         """
         self.x = x = self._folded(x)
         if self.stack.common_input:
-            weight, bias = self.stack.side_by_side(self.first, self.first_bias)
+            weight, bias = self.common or self.stack.side_by_side(self.first, self.first_bias)
             th.addmm(bias, x[0], weight, out=self.wide)
         else:
             self._layer(x, self.first, self.first_bias, self.wide)
@@ -343,6 +338,13 @@ class Evaluation:
         if self.member_bias is not None:
             z.add_(self.member_bias)
         return z
+
+    def first_weights(self, rows: th.Tensor) -> th.Tensor:
+        """
+        :param rows: (m, k), see :meth:`StackedMLP.first_layer_rows`
+        :return: (m, k, hidden)
+        """
+        return self.by_row.index_select(0, rows.view(-1)).view(*rows.shape, self.width)
 
     def rest(self) -> th.Tensor:
         """

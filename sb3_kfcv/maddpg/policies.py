@@ -286,11 +286,9 @@ class CentralCritics(nn.Module):
         :return: (agents, batch)
         """
         (inputs,) = self._inputs
-        stacks = [self.stacks[run] for run in range(len(self.positions))]
-        self._moved[:] = [stack.evaluation(len(inputs)) for stack in stacks]  # type: ignore[operator]
+        self._moved[:] = [stack.evaluation(len(inputs)) for stack, _ in zip(self.stacks, self.positions, strict=False)]  # type: ignore[operator]
         self._own_weights[:] = [
-            self.stacks[run].first_layer_weights(getattr(self, f"_own_rows_{i}"))  # type: ignore[operator]
-            for i, (run, _) in enumerate(self._places)
+            self._moved[run].first_weights(getattr(self, f"_own_rows_{i}")) for i, (run, _) in enumerate(self._places)
         ]
         first = [evaluation.first_layer(evaluation.x) for evaluation in self._moved]
         actions = inputs[:, self.actions_start :]
@@ -326,7 +324,7 @@ class CentralCritics(nn.Module):
         """Values of each stack (members, batch, 1) → (critics, agents, batch)."""
         n_runs = len(self.positions)
         critics = [by_agent(self.positions, values[i : i + n_runs]) for i in range(0, len(values), n_runs)]
-        return (critics[0].unsqueeze(0) if len(critics) == 1 else th.stack(critics)).squeeze(-1)
+        return (th.stack(critics) if len(critics) > 1 else critics[0].unsqueeze(0)).squeeze(-1)
 
     def _of_run(self, values: th.Tensor, run: int) -> th.Tensor:
         """(agents, …) → those of a run."""
