@@ -52,6 +52,14 @@ def test_outputs_are_those_of_separate_networks(common_input):
     close(stack.evaluate(x), expected)
 
 
+@pytest.mark.parametrize("members", [None, [0, 3, 1, 0]])
+def test_one_member_alone(members):
+    stack = StackedMLP(6, SIZES, members=members)
+    x = th.randn(stack.n_members, 4, SIZES[0])
+    for member in range(stack.n_members):
+        close(stack.one(member, x[member]), stack(x)[member])
+
+
 class Leaky(nn.Module):
     """An activation with a parameter of its own."""
 

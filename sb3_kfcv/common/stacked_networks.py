@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from itertools import pairwise
+from typing import Any
 
 import torch as th
 from torch import nn
@@ -147,6 +148,23 @@ class StackedMLP(nn.Module):
             z = layer(self.activation(z), self.members)
         return z
 
+    def one(self, member: int, x: th.Tensor) -> th.Tensor:
+        """
+        The values of one member alone, of a stack whose members have inputs of their own.
+
+        :param member: its number
+        :param x: (batch, in)
+        :return: (batch, out)
+        """
+        number = member if self.members is None else int(self.members[member])
+        network: Any = slice(number, number + 1)  # a view of the stack
+        z = self.first(x.unsqueeze(0), network)
+        if self.member_bias is not None:
+            z = z + self.member_bias[member]
+        for layer in self.rest:
+            z = layer(self.activation(z), network)
+        return z[0]
+
     def side_by_side(self, weight: th.Tensor, bias: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """First layer of all members on a common input: weight (in, members · hidden), bias (1, members · hidden)."""
         if self.wide_rows is None:
@@ -209,10 +227,11 @@ class StackedMLP(nn.Module):
         :param columns: (len(members), k) positions in the input
         :return: (len(members), k)
         """
+        numbers, device = th.tensor(list(members)), self.first.weight.device
         if self.wide_rows is not None:
-            wide = self.wide_rows.view(self.sizes[0], self.n_members)
-            return wide[columns, th.tensor(list(members))[:, None]]
-        return self._rows(th.tensor(list(members)) if self.members is None else self.members[list(members)], columns)
+            return self.wide_rows.view(self.sizes[0], self.n_members)[columns, numbers[:, None]]
+        networks = numbers.to(device) if self.members is None else self.members[numbers]
+        return self._rows(networks, columns.to(device))
 
     def _rows(self, networks: th.Tensor, columns: th.Tensor) -> th.Tensor:
         """The same by network (m,) instead of member."""

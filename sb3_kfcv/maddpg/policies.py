@@ -592,14 +592,7 @@ class MADDPGPolicy(BasePolicy):
             raise ValueError(f"an observation of {agent!r} has {size} values; got an array of shape {np.shape(observation)}")
         rows = th.as_tensor(np.atleast_2d(observation), dtype=th.float32, device=self.device)
         with th.no_grad():
-            number = member if stack.members is None else int(stack.members[member])
-            network = slice(number, number + 1)  # of the stack, a view
-            output = stack.first(rows.unsqueeze(0), network)  # (1, batch, hidden)
-            if stack.member_bias is not None:
-                output = output + stack.member_bias[member]
-            for layer in stack.rest:
-                output = layer(stack.activation(output), network)
-            output = output.squeeze(0)
+            output = stack.one(member, rows)
         if self.layout.discrete:
             actions = (output if deterministic else gumbel_perturbed(output)).argmax(-1).cpu().numpy()
         else:
