@@ -10,7 +10,7 @@ from numba import njit, types
 from numba.core import event
 from numba.experimental import structref
 
-NOTICE = "compiling the worlds' kernels (once per machine, about 10 s)…"
+NOTICE = "compiling kernels (once per machine, about 10 s)…"
 
 
 def drop_stale_cache(source: Path) -> None:
@@ -67,7 +67,7 @@ class _Notice(event.Listener):
     said = False
 
     def on_start(self, event: Any) -> None:
-        if not self.said and event.data["dispatcher"].py_func.__module__.startswith(f"{__package__}."):
+        if not self.said and event.data["dispatcher"].py_func.__module__.startswith("sb3_kfcv."):
             self.said = True
             print(NOTICE, file=sys.stderr, flush=True)
 
