@@ -14,6 +14,7 @@ SETTINGS = {
     "maximise": {"maximize": True},
     "AMSGrad": {"amsgrad": True},
     "not fused": {"fused": False},
+    "decoupled weight decay": {"weight_decay": 0.1, "decoupled_weight_decay": True},
 }
 
 
@@ -80,3 +81,34 @@ def test_a_closure_is_evaluated():
 
     losses = [optimizer.step(closure).item() for _ in range(20)]
     assert losses[-1] < losses[0]
+
+
+@pytest.mark.parametrize("which", [[0], [], [1, 2]], ids=["one", "none", "two"])
+def test_parameters_without_gradient_stand_still_and_go_on_later(which):
+    ours, theirs = optimiser(LeanAdam), optimiser(th.optim.Adam)
+    for seed in range(6):
+        for optimizer in (ours, theirs):
+            th.manual_seed(seed)
+            for i, parameter in enumerate(optimizer.param_groups[0]["params"]):
+                parameter.grad = th.randn_like(parameter) if seed % 3 or i in which else None
+            optimizer.step()
+        equal(ours, theirs)
+
+
+def test_hooks_are_called():
+    optimizer, calls = optimiser(LeanAdam), []
+    optimizer.register_step_post_hook(lambda *args: calls.append("after"))
+    optimizer.register_step_pre_hook(lambda *args: calls.append("before"))
+    for seed in range(3):
+        step(optimizer, seed)
+    assert calls == ["before", "after"] * 3
+
+
+def test_a_cleared_state_begins_anew():
+    ours, theirs = optimiser(LeanAdam), optimiser(th.optim.Adam)
+    for seed in range(4):
+        for optimizer in (ours, theirs):
+            if seed == 2:
+                optimizer.state.clear()
+            step(optimizer, seed)
+        equal(ours, theirs)

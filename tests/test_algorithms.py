@@ -1,5 +1,6 @@
 """The three algorithms run on every kind of world, as SB3's do."""
 
+import copy
 import inspect
 
 import gymnasium as gym
@@ -7,15 +8,16 @@ import numpy as np
 import pytest
 import torch as th
 from mpe2 import simple_tag_v3
-from references import parameters_of
+from references import fill, parameters_of
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from torch import nn
 from toy_envs import ToyParallelEnv
 
-from sb3_kfcv import ALGOS, KFCVMADDPG, MADDPG, PERMADDPG, JointEnv, ParticleVecEnv, make_vec_env
+from sb3_kfcv import ALGOS, KFCVMADDPG, MADDPG, PERMADDPG, JointEnv, ParticleVecEnv, make_vec_env, register
 from sb3_kfcv.envs import grassland_v0, hard_spread_v0
 from sb3_kfcv.maddpg.policies import MADDPGPolicy
 from sb3_kfcv.vec_env.make import make_joint_env, make_worlds
@@ -366,3 +368,57 @@ def test_tensorboard_and_text_logs_are_written(algo, tmp_path, capsys):
 def test_a_monitored_env_is_not_monitored_twice():
     model = make(MADDPG, Monitor(JointEnv(toy()))).learn(40)
     assert model.ep_info_buffer[-1]["r"] == 72
+
+
+# ---- what an update uses again is the learner's alone
+
+
+def test_predictions_leave_the_learners_tensors_alone():
+    """So that a model may be asked by several threads, and while it learns."""
+    model = make(MADDPG, grassland()).learn(40)
+    kept = [stack._evaluations[model.batch_size].layers[-1] for stack in model.actor.stacks]
+    before = [values.clone() for values in kept]
+    model.predict(np.zeros((model.batch_size, model.observation_space.shape[0]), np.float32))
+    for values, as_before in zip(kept, before, strict=True):
+        assert th.equal(values, as_before)
+
+
+def test_a_policy_that_has_learnt_can_be_copied():
+    model = make(MADDPG, grassland(), policy_kwargs={"activation_fn": nn.Tanh}).learn(40)
+    row = np.ones(model.observation_space.shape, np.float32)
+    expected = model.predict(row, deterministic=True)[0]
+    np.testing.assert_array_equal(copy.deepcopy(model.policy).predict(row, deterministic=True)[0], expected)
+
+
+class Drop(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.drop = nn.Dropout(0.5)
+
+    def forward(self, x):
+        return self.drop(x.relu())
+
+
+register("Drop in test_algorithms", Drop)
+
+
+def test_targets_and_single_agents_act_without_dropout():
+    model = make(MADDPG, grassland(), policy_kwargs={"activation_fn": Drop})
+    model.set_logger(Logger(None, []))
+    fill(model.replay_buffer, model.layout, 64)
+    model.train(1, 16)
+    assert not any(module.training for module in model.actor_target.modules())
+    own = np.ones(model.layout.obs_sizes[0], np.float32)
+    agent = model.layout.agents[0]
+    np.testing.assert_array_equal(model.predict_agent(agent, own), model.predict_agent(agent, own))
+
+
+@pytest.mark.parametrize("activation_fn", ["tanh", nn.Tanh()])
+def test_an_activation_that_is_no_class_is_refused(activation_fn):
+    with pytest.raises(ValueError, match=r"activation_fn must be a class, such as torch\.nn\.Tanh"):
+        make(MADDPG, grassland(), policy_kwargs={"activation_fn": activation_fn})
+
+
+def test_a_retired_setting_says_that_nothing_depends_on_it():
+    with pytest.raises(ValueError, match="sort_above is no setting any more: ranks are exact"):
+        make(PERMADDPG, grassland(), replay_buffer_kwargs={"sort_above": 10})

@@ -1,6 +1,7 @@
 """A stack of networks is what as many separate networks are: outputs, gradients, Adam steps, clipping."""
 
 import copy
+import pickle
 
 import numpy as np
 import pytest
@@ -121,13 +122,74 @@ def test_evaluations_follow_a_change_of_type():
     assert stack.evaluate(x.double()).dtype == th.double
 
 
-def test_a_copy_evaluates_with_its_own_parameters():
-    stack, x = stack_and_input(False)
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda stack: pickle.loads(pickle.dumps(stack))], ids=["copy", "pickle"])
+@pytest.mark.parametrize("activation_fn", [nn.ReLU, nn.Tanh])
+def test_a_copy_evaluates_with_its_own_parameters(copied, activation_fn):
+    stack, x = stack_and_input(False, activation_fn=activation_fn)
     stack.evaluate(x)
-    other = copy.deepcopy(stack)
+    other = copied(stack)
+    assert not other._evaluations
     nn.init.ones_(other.rest[-1].bias)
     close(other.evaluate(x), other(x))
     close(stack.evaluate(x), stack(x))
+
+
+@pytest.mark.parametrize("layer", ["first", "rest.0", "rest.1"])
+def test_evaluations_see_new_data_of_any_parameter(layer):
+    stack, x = stack_and_input(False)
+    before = stack.evaluate(x).clone()
+    weight = stack.get_parameter(f"{layer}.weight")
+    weight.data = th.zeros_like(weight)
+    close(stack.evaluate(x), stack(x))
+    assert not th.equal(stack.evaluate(x), before)
+
+
+@pytest.mark.parametrize("members", [None, [0, 3, 1, 0]])
+@INPUTS
+def test_frozen_parameters_get_no_gradient(common_input, members):
+    stack, x = stack_and_input(common_input, members=members)
+    for frozen in (False, True):
+        stack.first.requires_grad_(not frozen)
+        stack.rest[0].bias.requires_grad_(not frozen)
+        stack.evaluate(x)
+        stack.backward(th.ones(stack.n_members, 4, SIZES[-1]))
+    assert {name for name, parameter in stack.named_parameters() if parameter.grad is None} == {
+        "first.weight",
+        "first.bias",
+        "rest.0.bias",
+    }
+    stack.clip_gradients(1e-3)
+    assert stack.gradient_norms().max() < 1.1e-3
+
+
+class Unused(nn.Module):
+    """An activation of which a part is not used, a part is frozen."""
+
+    def __init__(self):
+        super().__init__()
+        self.unused = nn.Parameter(th.ones(1))
+        self.frozen = nn.Parameter(th.full((1,), 0.3), requires_grad=False)
+
+    def forward(self, x):
+        return x.sigmoid() * self.frozen
+
+
+class Step(nn.Module):
+    """An activation without a gradient."""
+
+    def forward(self, x):
+        return (x > 0).to(x.dtype)
+
+
+@pytest.mark.parametrize("activation_fn", [lambda: nn.ELU(inplace=True), Unused, Step], ids=["in place", "unused", "step"])
+def test_odd_activations_are_followed_too(activation_fn):
+    stack, x = stack_and_input(False, activation_fn=activation_fn)
+    gradient = th.randn(6, 4, SIZES[-1])
+    expected = th.autograd.grad(stack(x), list(stack.rest[-1].parameters()), gradient)
+    stack.evaluate(x)
+    stack.backward(gradient)
+    for parameter, theirs in zip(stack.rest[-1].parameters(), expected, strict=True):
+        close(parameter.grad, theirs)
 
 
 def test_a_borrower_evaluates_in_the_tensors_of_its_lender():

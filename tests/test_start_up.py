@@ -11,7 +11,9 @@ LATE = ["scipy.stats", "scipy.optimize", "matplotlib.pyplot", "tensorboard", "pa
 @pytest.fixture(scope="module")
 def loaded():
     """Modules that an import of this package loads beyond those of Stable-Baselines3."""
-    code = "import sys, stable_baselines3; before = set(sys.modules); import sb3_kfcv; print(*sorted(set(sys.modules) - before))"
+    code = (
+        "import sys, stable_baselines3; before = set(sys.modules); import sb3_kfcv; print(*sorted(set(sys.modules) - before))"
+    )
     return set(subprocess.check_output([sys.executable, "-c", code], text=True).split())
 
 

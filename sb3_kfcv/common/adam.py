@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
+from torch.optim.optimizer import Optimizer
+
+# Settings of a group that the fused kernel is not asked for here.
+UNUSUAL = ("amsgrad", "capturable", "differentiable", "decoupled_weight_decay")
+
+
+class _Found(NamedTuple):
+    """The tensors of a group, all of whose parameters have gradients."""
+
+    parameters: list[th.Tensor]
+    exp_avgs: list[th.Tensor]
+    exp_avg_sqs: list[th.Tensor]
+    steps: list[th.Tensor]
+    all_steps: th.Tensor  # these are views of it
 
 
 class LeanAdam(th.optim.Adam):
@@ -12,12 +26,11 @@ class LeanAdam(th.optim.Adam):
     ``torch.optim.Adam(fused=True)``, number for number and with the same state; but its tensors are found once instead of at
     every step, which for small networks takes as long as the step itself.
 
-    Whatever the fused kernel is not asked for here (several groups, closures, AMSGrad, a learning rate in a tensor) goes
-    through ``torch.optim.Adam``. All parameters are of one device and type, and all have gradients or none has.
+    Whatever the fused kernel is not asked for here (several groups, closures, parameters without gradient, AMSGrad, hooks …)
+    goes through ``torch.optim.Adam``.
     """
 
-    # Parameters, first and second moments, step counts, and these in one tensor
-    _found: tuple[list[th.Tensor], list[th.Tensor], list[th.Tensor], list[th.Tensor], th.Tensor] | None = None
+    _found: _Found | None = None
 
     @th.no_grad()
     def step(self, closure: Any = None) -> Any:
@@ -27,29 +40,24 @@ class LeanAdam(th.optim.Adam):
         :param closure: evaluates the loss anew
         :return: the closure's loss, if there is one
         """
-        (group, *more) = self.param_groups
-        if more or closure is not None or group["amsgrad"] or not group["fused"] or isinstance(group["lr"], th.Tensor):
-            return super().step(closure)
-        if self._found is None:
-            loss = super().step()  # makes the state
-            parameters = [parameter for parameter in group["params"] if parameter.grad is not None]
-            states = [self.state[parameter] for parameter in parameters]
-            all_steps = th.stack([state["step"] for state in states])
-            for state, steps in zip(states, all_steps, strict=True):
-                state["step"] = steps
-            moments = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
-            self._found = parameters, *moments, all_steps  # type: ignore[assignment]
-            return loss
-        parameters, exp_avgs, exp_avg_sqs, steps, all_steps = self._found
-        all_steps.add_(1)
+        group = self.param_groups[0]
+        gradients = [parameter.grad for parameter in group["params"]]
+        if closure is not None or self._is_unusual(group) or any(gradient is None for gradient in gradients):
+            self._found = None
+            return _plain_step(self, closure)
+        if self._found is None or len(self.state) != len(gradients):
+            _plain_step(self)  # makes the state
+            self._found = self._find(group)
+            return None
         beta1, beta2 = group["betas"]
+        self._found.all_steps.add_(1)
         th._fused_adam_(
-            parameters,
-            [parameter.grad for parameter in parameters],  # type: ignore[misc]
-            exp_avgs,
-            exp_avg_sqs,
+            self._found.parameters,
+            gradients,  # type: ignore[arg-type]
+            self._found.exp_avgs,
+            self._found.exp_avg_sqs,
             [],
-            steps,
+            self._found.steps,
             lr=group["lr"],
             beta1=beta1,
             beta2=beta2,
@@ -60,7 +68,25 @@ class LeanAdam(th.optim.Adam):
         )
         return None
 
-    step.hooked = True  # type: ignore[attr-defined]  # else Optimizer wraps it to record a profile at each call
+    step.hooked = True  # type: ignore[attr-defined]  # else Optimizer wraps it, which takes long; see _plain_step
+
+    def _is_unusual(self, group: dict[str, Any]) -> bool:
+        hooked = self._optimizer_step_pre_hooks or self._optimizer_step_post_hooks
+        return bool(
+            len(self.param_groups) > 1
+            or not group["fused"]
+            or isinstance(group["lr"], th.Tensor)
+            or any(group.get(setting) for setting in UNUSUAL)
+            or hooked
+        )
+
+    def _find(self, group: dict[str, Any]) -> _Found:
+        states = [self.state[parameter] for parameter in group["params"]]
+        all_steps = th.stack([state["step"] for state in states])
+        for state, steps in zip(states, all_steps, strict=True):
+            state["step"] = steps
+        exp_avgs, exp_avg_sqs, steps = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
+        return _Found(group["params"], exp_avgs, exp_avg_sqs, steps, all_steps)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As in PyTorch."""
@@ -70,3 +96,10 @@ class LeanAdam(th.optim.Adam):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self._found = None
+
+
+def _plain_step(optimizer: th.optim.Adam, closure: Any = None) -> Any:
+    """PyTorch's own step, with its hooks."""
+    step: Any = th.optim.Adam.step
+    step = step if getattr(step, "hooked", False) else Optimizer.profile_hook_step(step)
+    return step(optimizer, closure)

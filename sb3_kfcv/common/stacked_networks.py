@@ -8,6 +8,7 @@ of ``nn.Linear`` layers would, and is initialised as they are; :meth:`StackedMLP
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -203,12 +204,16 @@ class StackedMLP(nn.Module):
         :param batch: rows
         """
         found = self._evaluations.get(batch)
-        if found is None or not found.fits(self):
+        if found is None or not found.fits():
             if len(self._evaluations) >= SIZES_KEPT:
                 self._evaluations.clear()
             lent = [stack.evaluation(batch) for stack in self._lender]
             found = self._evaluations[batch] = Evaluation(self, batch, *lent)
         return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy evaluates in tensors of its own."""
+        return {**self.__dict__, "_evaluations": {}}
 
     def borrow(self, lender: StackedMLP) -> None:
         """
@@ -242,9 +247,8 @@ class StackedMLP(nn.Module):
     def gradient_norms(self) -> th.Tensor:
         """Euclidean norm of each network's gradient: (networks,)."""
         squares = self.first.weight.new_zeros(self.n_networks)
-        for layer in [self.first, *self.rest]:
-            for parameter in (layer.weight, layer.bias):
-                squares += self._network_view(parameter.grad, layer).square().sum((1, 3)).flatten()
+        for gradient in self._gradients():
+            squares += gradient.square().sum((1, 3)).flatten()
         if self.members is not None and self.member_bias is not None and self.member_bias.grad is not None:
             squares.index_add_(0, self.members, self.member_bias.grad.square().sum((1, 2)))
         return squares.sqrt()
@@ -252,19 +256,21 @@ class StackedMLP(nn.Module):
     def clip_gradients(self, max_norm: float) -> None:
         """Scale the gradient of each network down to ``max_norm``, as ``clip_grad_norm_`` does for a separate one."""
         scale = (max_norm / (self.gradient_norms() + 1e-6)).clamp(max=1.0)
-        for layer in [self.first, *self.rest]:
-            for parameter in (layer.weight, layer.bias):
-                view = self._network_view(parameter.grad, layer)
-                view.mul_(scale.view(view.shape[0], 1, view.shape[2], 1))
+        for gradient in self._gradients():
+            gradient.mul_(scale.view(gradient.shape[0], 1, gradient.shape[2], 1))
         if self.member_bias is not None and self.member_bias.grad is not None:
             self.member_bias.grad.mul_(scale[self.members].view(-1, 1, 1))
 
-    def _network_view(self, tensor: th.Tensor | None, layer: StackedLinear) -> th.Tensor:
-        """A parameter, or its gradient, viewed as (inputs, rows, networks per input, columns)."""
-        assert tensor is not None, "no gradient yet"
-        if layer is self.first:
-            return tensor.unflatten(-1, (-1, self.sizes[1]))
-        return tensor.unsqueeze(2)
+    def _gradients(self) -> Iterator[th.Tensor]:
+        """Of weights and biases that have one, each viewed as (inputs, rows, networks per input, columns)."""
+        for layer in [self.first, *self.rest]:
+            for parameter in (layer.weight, layer.bias):
+                if parameter.grad is not None:
+                    yield (
+                        parameter.grad.unflatten(-1, (-1, self.sizes[1]))
+                        if layer is self.first
+                        else parameter.grad.unsqueeze(2)
+                    )  # type: ignore[operator]
 
     @th.no_grad()
     def network(self, index: int) -> nn.Sequential:
@@ -285,7 +291,7 @@ class StackedMLP(nn.Module):
             linear = nn.Linear(weight.shape[0], weight.shape[1])
             linear.weight.copy_(weight.T)
             linear.bias.copy_(bias)
-            layers += [linear, type(self.activation)()]
+            layers += [linear, copy.deepcopy(self.activation)]
         return nn.Sequential(*layers[:-1])
 
 
@@ -311,7 +317,8 @@ class Evaluation:
         self.weights = [(weight.detach(), bias.detach()) for weight, bias in self.parameters]
         self.transposed = [weight.transpose(1, 2) for weight, _ in self.weights]
         self.first, self.first_bias = stack.first.weight.detach(), stack.first.bias.detach()
-        self.pointer = self.first.data_ptr()
+        self.watched = [*stack.parameters(recurse=True)]
+        self.pointers = [parameter.data_ptr() for parameter in self.watched]
         self.by_row = self.first.view(-1, self.width)
         self.common = None  # weight and bias of a common input, where they stand side by side
         if stack.common_input and self.wide_rows is None:
@@ -338,9 +345,9 @@ class Evaluation:
         wide = self.first.new_empty(self.batch, stack.n_members * self.width)
         return wide, stack.spread(wide)
 
-    def fits(self, stack: StackedMLP) -> bool:
+    def fits(self) -> bool:
         """Whether it is for the parameters as they are: a module's ``to`` replaces their data."""
-        return stack.first.weight.data_ptr() == self.pointer
+        return list(map(th.Tensor.data_ptr, self.watched)) == self.pointers
 
     def first_layer(self, x: th.Tensor) -> th.Tensor:
         """
@@ -411,34 +418,42 @@ class Evaluation:
 
     def _write_gradients(self, x: th.Tensor, gradient: th.Tensor, weight: nn.Parameter, bias: nn.Parameter) -> None:
         """Of a layer with input ``x``, from the gradient at its output."""
-        if self.members is None:
-            th.bmm(x.transpose(1, 2), gradient, out=gradient_of(weight))
-            th.sum(gradient, dim=1, keepdim=True, out=gradient_of(bias))
-        else:
-            gradient_of(weight).zero_().index_add_(0, self.members, th.bmm(x.transpose(1, 2), gradient))
-            gradient_of(bias).zero_().index_add_(0, self.members, gradient.sum(1, keepdim=True))
+        if (into := gradient_of(weight)) is not None:
+            if self.members is None:
+                th.bmm(x.transpose(1, 2), gradient, out=into)
+            else:
+                into.zero_().index_add_(0, self.members, th.bmm(x.transpose(1, 2), gradient))
+        if (into := gradient_of(bias)) is not None:
+            if self.members is None:
+                th.sum(gradient, dim=1, keepdim=True, out=into)
+            else:
+                into.zero_().index_add_(0, self.members, gradient.sum(1, keepdim=True))
 
     def _write_first_gradients(self) -> None:
         stack, gradient = self.stack, self.gradients[0]
-        weight, bias = stack.first.weight, stack.first.bias
         if not stack.common_input:
-            self._write_gradients(self.x, gradient, weight, bias)
-        elif self.wide_rows is None:
-            th.mm(self.x[0].T, self.wide_gradient, out=gradient_of(weight)[0])
-            th.sum(self.wide_gradient, dim=0, keepdim=True, out=gradient_of(bias)[0])
+            self._write_gradients(self.x, gradient, stack.first.weight, stack.first.bias)
         else:
-            wide = th.mm(self.x[0].T, self.wide_gradient).view(-1, self.width)
-            gradient_of(weight).zero_().view(-1, self.width).index_add_(0, self.wide_rows, wide)
-            gradient_of(bias).zero_().view(-1, self.width).index_add_(0, stack.members, gradient.sum(1))  # type: ignore[arg-type]
-        if stack.member_bias is not None:
-            th.sum(self._unfolded(gradient), dim=1, keepdim=True, out=gradient_of(stack.member_bias))
+            if (into := gradient_of(stack.first.weight)) is not None:
+                if self.wide_rows is None:
+                    th.mm(self.x[0].T, self.wide_gradient, out=into[0])
+                else:
+                    wide = th.mm(self.x[0].T, self.wide_gradient).view(-1, self.width)
+                    into.zero_().view(-1, self.width).index_add_(0, self.wide_rows, wide)
+            if (into := gradient_of(stack.first.bias)) is not None:
+                if self.wide_rows is None:
+                    th.sum(self.wide_gradient, dim=0, keepdim=True, out=into[0])
+                else:
+                    into.zero_().view(-1, self.width).index_add_(0, stack.members, gradient.sum(1))  # type: ignore[arg-type]
+        if stack.member_bias is not None and (into := gradient_of(stack.member_bias)) is not None:
+            th.sum(self._unfolded(gradient), dim=1, keepdim=True, out=into)
 
     def _activate(self, z: th.Tensor) -> th.Tensor:
         if self.relu:
             return z.relu_()
         with th.enable_grad():
             leaf = z.detach().requires_grad_()
-            hidden = self.stack.activation(leaf)
+            hidden = self.stack.activation(leaf.clone())  # it may work in place
         self.graphs.append((leaf, hidden))
         return hidden.detach()
 
@@ -452,19 +467,25 @@ class Evaluation:
             _threshold_backward(gradient, self.layers[i], 0, grad_input=gradient)
             return
         leaf, hidden = self.graphs[i]
-        own = list(self.stack.activation.parameters()) if parameters else []  # such as nn.PReLU's
-        before, *found = th.autograd.grad(hidden, [leaf, *own], gradient)
+        if not hidden.requires_grad:  # a step, say
+            gradient.zero_()
+            return
+        own = [p for p in self.stack.activation.parameters() if p.requires_grad] if parameters else []  # such as nn.PReLU's
+        before, *found = th.autograd.grad(hidden, [leaf, *own], gradient, allow_unused=True)
         gradient.copy_(before)
         for parameter, part in zip(own, found, strict=True):
             first = i == len(self.weights) - 1  # backpropagation begins at the last activation
-            parameter.grad = part if first or parameter.grad is None else parameter.grad + part
+            if part is not None:
+                parameter.grad = part if first or parameter.grad is None else parameter.grad + part
 
 
 _threshold_backward = th.ops.aten.threshold_backward.grad_input
 
 
-def gradient_of(parameter: nn.Parameter) -> th.Tensor:
-    """The tensor of a parameter's gradient, to be written anew."""
-    if parameter.grad is None:
+def gradient_of(parameter: nn.Parameter) -> th.Tensor | None:
+    """The tensor of a parameter's gradient, to be written anew; ``None`` if the parameter is frozen."""
+    if not parameter.requires_grad:
+        parameter.grad = None
+    elif parameter.grad is None:
         parameter.grad = th.empty_like(parameter)
     return parameter.grad

@@ -36,6 +36,7 @@ from sb3_kfcv.maddpg.policies import (
     StackedActors,
 )
 from sb3_kfcv.replay import JointReplayBuffer, JointReplayBufferSamples
+from sb3_kfcv.saving.attributes import RETIRED_SETTINGS
 from sb3_kfcv.saving.saveable import SaveableAlgorithm
 from sb3_kfcv.vec_env.make import layout_of, wrap_env
 
@@ -244,6 +245,11 @@ class MADDPG(SaveableAlgorithm):
         require_count("learning_starts", self.learning_starts, least=0)
         require_count("gradient_steps", self.gradient_steps, least=-1)
         require_count("train_freq", self.train_freq[0] if isinstance(self.train_freq, tuple) else self.train_freq)
+        for name in set(RETIRED_SETTINGS) & set(self.replay_buffer_kwargs):
+            raise ValueError(f"{name} is no setting any more: ranks are exact for every size of buffer")
+        activation = self.policy_kwargs.get("activation_fn", nn.ReLU)
+        if isinstance(activation, str | nn.Module):
+            raise ValueError(f"activation_fn must be a class, such as torch.nn.Tanh; got {activation!r}")
         require_parameters("policy_kwargs", self.policy_kwargs, self.policy_class)
         require_parameters("replay_buffer_kwargs", self.replay_buffer_kwargs, self.replay_buffer_class)  # type: ignore[arg-type]
         if isinstance(self.learning_rate, str):
@@ -380,7 +386,7 @@ class MADDPG(SaveableAlgorithm):
 
     def _target_actions(self, observations: th.Tensor) -> th.Tensor:
         """(batch, joint action): a' of all agents, the learning ones by their target actors."""
-        actions = self.policy.joint_actions(self.actor_target, observations)
+        actions = self.policy.joint_actions(self.actor_target, observations, learning=True)
         if self.target_policy_noise > 0 and not self.layout.discrete:
             noise = th.randn_like(actions).mul_(self.target_policy_noise)
             actions = (actions + noise.clamp_(-self.target_noise_clip, self.target_noise_clip)).clamp_(-1, 1)

@@ -118,15 +118,16 @@ class StackedActors(nn.Module):
             self.stacks.append(StackedMLP(n_networks, sizes, activation_fn, members=members))
         self._latest: list[tuple[th.Tensor, th.Tensor]] = []  # per block: outputs and actions of the latest evaluation
 
-    def forward(self, observations: th.Tensor, explore: bool = False) -> list[th.Tensor]:
+    def forward(self, observations: th.Tensor, explore: bool = False, learning: bool = False) -> list[th.Tensor]:
         """
         The actions as a critic sees them; the choice of a discrete agent has no gradient.
 
         :param observations: joint rows (batch, joint)
         :param explore: discrete agents draw from their softmax instead of taking its maximum
+        :param learning: within an update: work in tensors that are used again
         :return: per block (agents, batch, action)
         """
-        outputs = self._outputs(observations)
+        outputs = self._outputs(observations, learning)
         if not self.layout.discrete:
             return [th.tanh(output) for output in outputs]
         if explore:
@@ -141,7 +142,7 @@ class StackedActors(nn.Module):
         :param temperature: of the Gumbel-softmax
         :return: per block (agents, batch, action)
         """
-        outputs = self._outputs(observations)
+        outputs = self._outputs(observations, learning=True)
         if not self.layout.discrete:
             actions = [th.tanh(output) for output in outputs]
         else:
@@ -168,10 +169,14 @@ class StackedActors(nn.Module):
                 at_output = at_output.addcmul_(output, penalties[block.positions].unsqueeze(-1), value=2 / output.shape[-1])
             stack.backward(at_output)  # type: ignore[operator]
 
-    def _outputs(self, observations: th.Tensor) -> list[th.Tensor]:
+    def __getstate__(self) -> dict[str, Any]:
+        """What the latest evaluation left is not copied."""
+        return {**self.__dict__, "_latest": []}
+
+    def _outputs(self, observations: th.Tensor, learning: bool) -> list[th.Tensor]:
         """What the last layers give, per block (agents, batch, action)."""
         return [
-            (stack if th.is_grad_enabled() else stack.evaluate)(block.obs_columns.read(observations))  # type: ignore[operator]
+            (stack.evaluate if learning else stack)(block.obs_columns.read(observations))  # type: ignore[operator]
             for stack, block in zip(self.stacks, self.blocks, strict=True)
         ]
 
@@ -259,7 +264,7 @@ class CentralCritics(nn.Module):
         return self._by_critic([stack(read) for stack, read in zip(self.stacks, self._reads(inputs), strict=True)])
 
     def evaluate(self, inputs: th.Tensor) -> th.Tensor:
-        """As :meth:`forward`, and remembered for :meth:`backward`."""
+        """As :meth:`forward`, and remembered for :meth:`backward`; overwritten by the next evaluation."""
         self._inputs[:] = [inputs]
         reads = self._reads(inputs)
         return self._by_critic([stack.evaluate(read) for stack, read in zip(self.stacks, reads, strict=True)])  # type: ignore[operator]
@@ -315,6 +320,10 @@ class CentralCritics(nn.Module):
             th.bmm(first[run] if members is None else first[run][members], weights.transpose(1, 2))
             for (run, members), weights in zip(self._places, self._own_weights, strict=True)
         ]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What the latest evaluation left is not copied."""
+        return {**self.__dict__, "_inputs": [], "_moved": [], "_own_weights": []}
 
     def _reads(self, inputs: th.Tensor) -> list[th.Tensor]:
         """What each stack reads."""
@@ -520,6 +529,7 @@ class MADDPGPolicy(BasePolicy):
         for network, target in ((self.actor, self.actor_target), (self.critic, self.critic_target)):
             target.load_state_dict(network.state_dict())
             target.requires_grad_(False)
+            target.train(False)
             for target_stack, stack in zip(target.stacks, network.stacks, strict=True):
                 target_stack.borrow(stack)  # type: ignore[operator]
             fused = optimizer_class is th.optim.Adam and optimizer_kwargs.get("fused")
@@ -534,16 +544,19 @@ class MADDPGPolicy(BasePolicy):
         rows = self.joint_actions(self.actor, observation, explore=not deterministic)
         return self.choices(rows) if self.layout.discrete else rows
 
-    def joint_actions(self, actors: StackedActors, observations: th.Tensor, explore: bool = False) -> th.Tensor:
+    def joint_actions(
+        self, actors: StackedActors, observations: th.Tensor, explore: bool = False, learning: bool = False
+    ) -> th.Tensor:
         """
         The joint action as a critic sees it; zeros for agents that do not learn.
 
         :param actors: the actors, or their targets
         :param observations: joint rows (batch, joint)
         :param explore: discrete agents draw from their softmax instead of taking its maximum
+        :param learning: see :meth:`StackedActors.forward`
         :return: (batch, joint action)
         """
-        chosen = actors(observations, explore)
+        chosen = actors(observations, explore, learning)
         if len(actors.blocks) == 1 and len(actors.blocks[0].agents) == self.layout.n_agents:
             return chosen[0].transpose(0, 1).flatten(1)
         rows = observations.new_zeros(len(observations), sum(self.layout.action_sizes))
@@ -591,6 +604,7 @@ class MADDPGPolicy(BasePolicy):
         if np.ndim(observation) not in (1, 2) or np.shape(observation)[-1] != size:
             raise ValueError(f"an observation of {agent!r} has {size} values; got an array of shape {np.shape(observation)}")
         rows = th.as_tensor(np.atleast_2d(observation), dtype=th.float32, device=self.device)
+        self.set_training_mode(False)
         with th.no_grad():
             output = stack.one(member, rows)
         if self.layout.discrete:

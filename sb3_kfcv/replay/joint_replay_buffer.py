@@ -217,6 +217,7 @@ class JointReplayBuffer(ReplayBuffer):
 
         :raises ValueError: if the env does not give per-agent values
         """
+        self._successors.make_room()
         pos = self.pos
         try:
             self.rewards[pos] = [info["agent_rewards"] for info in infos]
@@ -261,6 +262,7 @@ class JointReplayBuffer(ReplayBuffer):
         :param weights: (batch,) importance weights
         :raises IndexError: if there is no such row
         """
+        rows = np.asarray(rows)
         if not (0 <= rows.min(initial=0) and rows.max(initial=0) < max(self.n_rows, 1)):
             raise IndexError(f"rows {rows.min()} to {rows.max()} of a buffer that holds {self.n_rows}")
         return self._gather(rows, weights, self._empty(len(rows)))

@@ -50,6 +50,15 @@ class Successors:
         self._free = np.arange(self._room - 1, self.n_worlds - 1, -1, dtype=np.int32)  # places where nothing lies, a stack
         self._n_free = len(self._free)
 
+    def make_room(self) -> None:
+        """
+        For the next :meth:`add`; to be called before anything of that step is written.
+
+        :raises MemoryError: if there is none
+        """
+        if self._n_free < self.n_worlds:
+            self._grow(int(GROWTH * self._room) + self.n_worlds)
+
     def add(self, step: int, previous: int | None, following: Mapping[str, np.ndarray | list[np.ndarray]]) -> None:
         """
         Take in a step whose start has just been written in place of the oldest.
@@ -58,8 +67,6 @@ class Successors:
         :param previous: where the step before lies; ``None`` if it is not there (any more)
         :param following: what the step leads to: name → (worlds, …)
         """
-        if self._n_free < self.n_worlds:
-            self._grow(int(GROWTH * self._room) + self.n_worlds)
         before = -1 if previous is None else previous
         arrays = (*self._starts.values(), *self._apart.values())
         starts, other_starts, apart, other_apart = (array.view(bits) for array, bits in zip(arrays, self._bits, strict=True))
