@@ -35,8 +35,7 @@ benchmark-scale: $(VENV)/.installed  ## Measure how time and memory grow, and dr
 
 benchmark-training: $(VENV)/.installed  ## Measure a tenth of the paper's trainings, and project the whole (half an hour)
 	$(BIN)/python benchmarks/full_training.py
-	$(BIN)/python benchmarks/full_training.py --worlds Grassland-v0 --params critic_input:state \
-		--output docs/results/full_training_state.json
+	$(BIN)/python benchmarks/full_training.py --worlds Grassland-v0 --params critic_input:state
 
 benchmark-peers: $(VENV)/.installed  ## Measure ours beside the peers (under an hour, gigabytes; builds their environments)
 	$(BIN)/python benchmarks/compare.py

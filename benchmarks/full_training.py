@@ -185,7 +185,7 @@ class Training:
                 f"{self.env_steps:,}",
                 f"{self.updates:,}",
             ),
-            f"{self.measured:.1f} min",
+            f"{self.measured:.1f} min ({self.share:.0%})",
             f"**{self.projected:.1f} ± {self.uncertainty:.1f} min**",
             *(f"{minutes:.1f} min" for minutes in parts),
             f"{self.evaluation_minutes + self.checkpoint_minutes:.1f} min",
@@ -258,25 +258,30 @@ def main() -> None:
     parser.add_argument("--algos", nargs="+", choices=list(ALGOS), default=list(ALGOS), help="(default: all)")
     parser.add_argument("--share", type=float, default=0.1, help="of each training that is run (default: %(default)s)")
     parser.add_argument("--params", nargs="+", default=[], metavar="KEY:VALUE", help="such as critic_input:state")
-    parser.add_argument("--output", type=Path, help="JSON file (default: in docs/results/, unless less or other is measured)")
+    parser.add_argument("--output", type=Path, help="JSON file (default: in docs/results/, unless less is measured)")
     args = parser.parse_args()
     if not 0 < args.share <= 1:
         parser.error(f"--share is {args.share}; it must be above 0 and at most 1")
     quick = Path(tempfile.gettempdir()) / RESULTS.name
-    whole = args.share >= parser.get_default("share") and not args.params
-    output = args.output or (RESULTS if whole else quick)
+    output = args.output or (RESULTS if args.share >= parser.get_default("share") else quick)
     th.set_num_threads(1)
     warnings.simplefilter("ignore")
     facts = {"date": time.strftime("%Y-%m-%d"), "processor": cpu_model(), "threads": 1, "versions": versions_of(PACKAGES)}
-    trainings = []
+    trainings = {} if not output.exists() else {key(known): known for known in json.loads(output.read_text())["trainings"]}
     for world in args.worlds:
         for algo in args.algos:
-            trainings.append(measure(world, algo, args.share, args.params))
-            print(" | ".join(trainings[-1].cells()), file=sys.stderr, flush=True)
-    results = {**facts, "trainings": [asdict(training) for training in trainings]}
+            training = measure(world, algo, args.share, args.params)
+            print(" | ".join(training.cells()), file=sys.stderr, flush=True)
+            trainings[key(asdict(training))] = asdict(training)
+            results = {**facts, "trainings": list(trainings.values())}
+            with atomic_write(output) as file:
+                file.write(json.dumps(results, indent=1).encode())
     print(table(results))
-    with atomic_write(output) as file:
-        file.write(json.dumps(results, indent=1).encode())
+
+
+def key(training: dict[str, Any]) -> tuple[Any, ...]:
+    """What a training is told from others by; measured again, it takes the place of what was written before."""
+    return training["world"], training["algo"], *training["params"]
 
 
 if __name__ == "__main__":

@@ -69,7 +69,6 @@ TABLES: dict[str, tuple[str, str, Callable[[dict[str, Any]], str]]] = {
     "peers": ("peers", "benchmark-peers", peers),
     "best-batches": ("peers", "benchmark-peers", best_batches),
     "training": ("full_training", "benchmark-training", trainings),
-    "training-state": ("full_training_state", "benchmark-training", trainings),
     **{f"speed-{group.replace(' ', '-')}": ("speed", "benchmark", partial(speeds, group=group)) for group in speed.GROUPS},
     **{
         f"scale-{picture}": ("scale", "benchmark-scale", partial(growth, picture=picture))
