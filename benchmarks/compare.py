@@ -8,7 +8,7 @@ Ours beside the peers: the same work, alternating process by process (ours, thei
 Each peer has an environment of its own under ``.peers/``, built from ``benchmarks/peers/requirements/`` when it is not there;
 one that cannot be built or run is told in the table and stops nothing. A process does the cases of one kind one after the
 other: of each it warms up, times a few blocks and gives their median; the table has the median and the range of these over
-the processes, and the ratio of the two medians.
+the processes, and the ratio of the two medians. What was measured before of other cases or peers stays.
 Writes ``docs/results/peers.md`` and, with every block, ``docs/results/peers.json``.
 """
 
@@ -329,6 +329,15 @@ def overview(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def with_others(pairs: list[Pair], written: Path) -> list[Pair]:
+    """The pairs just measured, and those written before of other cases or peers, in the order of the cases."""
+    measured = {(pair.case, pair.peer) for pair in pairs}
+    before = pairs_of(json.loads(written.read_text())) if written.exists() else []
+    kept = [pair for pair in before if pair.case in CASES and (pair.case, pair.peer) not in measured]
+    places = [list(CASES), list(PEERS)]
+    return sorted(kept + pairs, key=lambda pair: (places[0].index(pair.case), places[1].index(pair.peer)))
+
+
 def pairs_of(results: dict[str, Any]) -> list[Pair]:
     """The pairs that were written as JSON."""
     return [Pair(**{**pair, "ours": Side(**pair["ours"]), "theirs": Side(**pair["theirs"])}) for pair in results["pairs"]]
@@ -379,6 +388,7 @@ def main() -> None:
         "blocks": blocks,
         "minutes": round((time.perf_counter() - start) / 60, 1),
     }
+    pairs = with_others(pairs, output.with_suffix(".json"))
     text = report(pairs, broken, facts)
     print(text)
     with atomic_write(output) as file:
