@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from torch import nn
 
 from sb3_kfcv.common.checks import require_between, require_count, require_finite_columns, require_parameters
+from sb3_kfcv.common.denormals import without_denormals
 from sb3_kfcv.common.live import shares
 from sb3_kfcv.common.memory import free_memory, in_words
 from sb3_kfcv.common.naming import unknown_name
@@ -289,6 +290,7 @@ class MADDPG(SaveableAlgorithm):
         # Asked for at every update, and slow to gather.
         self._parameters: dict[nn.Module, list[nn.Parameter]] = {network: list(network.parameters()) for network in networks}
 
+    @without_denormals()
     @th.no_grad()
     def train(self, gradient_steps: int, batch_size: int = 128) -> None:
         """
