@@ -103,7 +103,7 @@ def random_env(n_agents: int, obs_size: int, action_size: int) -> Any:
             return TensorDict({**self.observation_spec.rand(), **self.full_reward_spec.rand(), **self.done_spec.zero()}, [])
 
         def _set_seed(self, seed: int | None) -> None:
-            pass
+            """Asked for by TorchRL; what is drawn here decides nothing."""
 
     return RandomEnv()
 
