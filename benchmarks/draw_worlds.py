@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from sb3_kfcv import make_vec_env
-from sb3_kfcv.common.team_policy import TeamPolicy
+from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import layout_of
 
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "images" / "worlds.png"

@@ -13,10 +13,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sb3_kfcv.common.team_policy import TeamPolicy
 from sb3_kfcv.envs.grassland import GrasslandWorlds
 from sb3_kfcv.envs.hard_spread import HardSpreadWorlds
 from sb3_kfcv.envs.particle_worlds import ParticleWorlds
+from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.particle_vec_env import ParticleVecEnv
 
 WORLDS: dict[str, Callable[[int], ParticleWorlds]] = {"HardSpread-v0": HardSpreadWorlds, "Grassland-v0": GrasslandWorlds}

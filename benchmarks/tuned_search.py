@@ -20,8 +20,8 @@ import torch as th
 
 from sb3_kfcv import ALGOS, make_vec_env
 from sb3_kfcv.common.evaluation import evaluate
-from sb3_kfcv.common.team_policy import TeamPolicy
 from sb3_kfcv.saving.files import atomic_write
+from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import layout_of
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"

@@ -34,12 +34,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from torch import nn
 
 from sb3_kfcv import KFCVMADDPG, MADDPG, FileFormatError, KFCVReplayBuffer, MlpPolicy, register
+from sb3_kfcv.common.actors import ActorPolicy
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.saving import values
 from sb3_kfcv.saving.archive import FORMAT_VERSION, MANIFEST, open_archive, write_archive
 from sb3_kfcv.saving.checkpoints import Checkpoint
 from sb3_kfcv.saving.transitions import packed, unpacked
 from sb3_kfcv.saving.values import ARRAY_KINDS, UnwritableError
+from sb3_kfcv.teams.players import Mixture
 
 DTYPES = [np.dtype(name) for name in ("?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")]
 TENSOR_DTYPES = [dtype for dtype in DTYPES if dtype.str not in ("<u2", "<u4", "<u8")]
@@ -152,6 +154,13 @@ OF_EVERY_KIND = {
         in_mid_course(VectorizedActionNoise(NormalActionNoise(0 * SIZE, SIZE), 3)),
         in_mid_course(VectorizedActionNoise(OrnsteinUhlenbeckActionNoise(0 * SIZE, SIZE, initial_noise=SIZE), 2)),
     ],
+    "ActorPolicy": [
+        ActorPolicy.of(MADDPG("MlpPolicy", toy()).policy),
+        ActorPolicy.of(
+            MADDPG("MlpPolicy", toy(discrete=True), share_parameters=True, policy_kwargs={"activation_fn": nn.Tanh}).policy
+        ),
+    ],
+    "Mixture": [Mixture(["flee", "graze"], [3, 1]), Mixture([ActorPolicy.of(MADDPG("MlpPolicy", toy()).policy), "random"])],
 }
 
 

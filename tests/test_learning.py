@@ -5,7 +5,7 @@ import pytest
 
 from sb3_kfcv import KFCVMADDPG, MADDPG, PERMADDPG, make_vec_env
 from sb3_kfcv.common.evaluation import evaluate
-from sb3_kfcv.common.team_policy import TeamPolicy
+from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import layout_of
 
 ALGOS = [MADDPG, PERMADDPG, KFCVMADDPG]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from sb3_kfcv.common.layout import AgentLayout
-from sb3_kfcv.common.team_policy import TeamPolicy
 from sb3_kfcv.envs.grassland import GrasslandWorlds
 from sb3_kfcv.envs.hard_spread import HardSpreadWorlds
 from sb3_kfcv.envs.scripted import SCRIPTED_POLICIES, nearest_choice, scripted_policy
+from sb3_kfcv.teams.team_policy import TeamPolicy
 
 
 def spread_layout(n: int = 2, discrete: bool = False) -> AgentLayout:

@@ -18,9 +18,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sb3_kfcv import ALGOS, KFCVMADDPG, make_vec_env
 from sb3_kfcv.common.callbacks import StopOnSignal, TrainByTheClock
 from sb3_kfcv.common.evaluation import evaluate, with_interval
-from sb3_kfcv.common.team_policy import TeamPolicy
 from sb3_kfcv.saving.checkpoints import checkpoints_in
 from sb3_kfcv.saving.normalization import load_normalization
+from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import WORLDS, layout_of
 from zoo import demo, train
 from zoo.hyperparams import check, load_entry, merged, parse_pairs
@@ -229,7 +229,7 @@ BAD_INPUT = [
     ("--env-kwargs n_wolves:0", "n_wolves is 0; it must be at least 1"),
     ("--env HardSpread-v0 --env-kwargs walls:3", "walls is 3; it must be text or a list of lists of numbers"),
     ("--eval-env-kwargs n_wolves:3", "make a world whose agents are not those of the training"),
-    ("--team wolf --opponents sheep:fle", "did you mean 'flee'?"),
+    ("--team wolf --opponents sheep:fle", 'did you mean "flee"?'),
     ("--eval-episodes 0", "--eval-episodes is 0; it must be at least 1"),
 ]
 

@@ -18,8 +18,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import e
 from sb3_kfcv.common.callbacks import TrainByTheClock
 from sb3_kfcv.common.evaluation import evaluate, with_interval
 from sb3_kfcv.common.layout import AgentLayout
-from sb3_kfcv.common.team_policy import JointModel, TeamPolicy
 from sb3_kfcv.saving.files import atomic_write
+from sb3_kfcv.teams.players import JointModel
+from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env import make_vec_env
 from sb3_kfcv.vec_env.make import layout_of
 from zoo.plots import ALGO_COLOURS, ALGO_LABELS, draw_curve, draw_references, new_figure, save_figure

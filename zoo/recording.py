@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_kfcv.common.team_policy import JointModel
 from sb3_kfcv.saving.files import atomic_write
+from sb3_kfcv.teams.players import JointModel
 
 PAUSE = 5  # frames for which the last picture of an episode stands still
 
@@ -24,10 +24,10 @@ def record(policy: JointModel, env: VecEnv, n_episodes: int) -> list[np.ndarray]
     :param n_episodes: number of episodes
     :return: frames, uint8 (height, width, 3)
     """
-    observations = env.reset()
+    observations, dones, memory = env.reset(), np.ones(1, dtype=bool), None
     frames = [_picture(env)]
     while n_episodes > 0:
-        actions, _ = policy.predict(observations, deterministic=True)
+        actions, memory = policy.predict(observations, state=memory, episode_start=dones, deterministic=True)
         observations, _, dones, _ = env.step(actions)
         if dones[0]:
             n_episodes -= 1

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import stdtrit
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_kfcv.common.team_policy import JointModel
+from sb3_kfcv.teams.players import JointModel
 
 CONFIDENCE = 0.95
 
@@ -31,7 +31,7 @@ def evaluate(policy: JointModel, env: VecEnv, n_episodes: int, deterministic: bo
     Each world plays its share of the episodes, fixed beforehand: worlds with short episodes count no more than others.
     The worlds are reset first and go on with their own random generators, so every call sees fresh ones.
 
-    :param policy: a model, a :class:`~sb3_kfcv.common.team_policy.TeamPolicy`, or whatever acts on joint rows
+    :param policy: a model, a :class:`~sb3_kfcv.teams.team_policy.TeamPolicy`, or whatever acts on joint rows
     :param env: vec env of joint worlds, monitored or not; a ``VecNormalize`` should have ``training=False``
     :param n_episodes: number of episodes
     :param deterministic: without exploration
@@ -46,10 +46,11 @@ def evaluate(policy: JointModel, env: VecEnv, n_episodes: int, deterministic: bo
     rewards_so_far, steps_so_far = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=int)
     episodes: list[dict[str, float]] = []
 
-    observations = env.reset()
+    observations, starts, memory = env.reset(), np.ones(env.num_envs, dtype=bool), None
     while len(episodes) < n_episodes:
-        actions, _ = policy.predict(observations, deterministic=deterministic)  # type: ignore[arg-type]
+        actions, memory = policy.predict(observations, state=memory, episode_start=starts, deterministic=deterministic)
         observations, rewards, dones, infos = env.step(actions)
+        starts = dones
         rewards_so_far += rewards
         steps_so_far += 1
         for i in np.flatnonzero(dones):

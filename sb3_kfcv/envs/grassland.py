@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -101,6 +102,7 @@ class GrasslandWorlds(ParticleWorlds):
         "wolves_win",
     )
     scalar_reward = "wolf"
+    wins: ClassVar[Mapping[str, str]] = {"wolf": "wolves_win"}
 
     def __init__(
         self,

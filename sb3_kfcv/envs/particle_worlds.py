@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -58,6 +58,8 @@ class ParticleWorlds(ABC):
     """Names of the columns of :meth:`episode_metrics`."""
     scalar_reward: str
     """What a single reward for the whole world stands for: ``"mean"`` over all agents, or over the group named."""
+    wins: ClassVar[Mapping[str, str]] = {}
+    """Which group can win, and the metric in [0, 1] that tells how far; of two groups, the other one wins the rest."""
     render_fps = round(1 / physics.DT)
 
     def __init__(

@@ -3,31 +3,29 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Sequence
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Collection
+from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, safe_mean
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
 from sb3_kfcv.common.checks import require_between, require_count, require_finite_columns, require_parameters
 from sb3_kfcv.common.denormals import without_denormals
+from sb3_kfcv.common.joint_algorithm import JointAlgorithm
 from sb3_kfcv.common.live import shares
 from sb3_kfcv.common.memory import free_memory, in_words
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.noise import OneDraw
-from sb3_kfcv.common.patient_logs import patience
 from sb3_kfcv.common.schedules import schedule_of
-from sb3_kfcv.common.team_policy import TeamPolicy
 from sb3_kfcv.maddpg.diagnostics import Diagnostics
 from sb3_kfcv.maddpg.policies import (
     CRITIC_INPUTS,
@@ -38,16 +36,12 @@ from sb3_kfcv.maddpg.policies import (
 )
 from sb3_kfcv.replay import JointReplayBuffer, JointReplayBufferSamples
 from sb3_kfcv.saving.attributes import RETIRED_SETTINGS
-from sb3_kfcv.saving.saveable import SaveableAlgorithm
-from sb3_kfcv.vec_env.make import layout_of, wrap_env
-
-SelfMADDPG = TypeVar("SelfMADDPG", bound="MADDPG")
-
-# Log formats that cannot show a histogram.
-NOT_TENSORBOARD = ("stdout", "log", "json", "csv")
+from sb3_kfcv.saving.values import UnwritableError
+from sb3_kfcv.teams.team_policy import LineUp, TeamPolicy
+from sb3_kfcv.vec_env.make import layout_of
 
 
-class MADDPG(SaveableAlgorithm):
+class MADDPG(JointAlgorithm):
     """
     Multi-Agent Deep Deterministic Policy Gradient (Lowe et al. 2017; eq. 5–6 and Algorithm 1 of Lin et al. 2022).
 
@@ -79,8 +73,8 @@ class MADDPG(SaveableAlgorithm):
     :param share_parameters: one actor and one critic per group of agents instead of per agent. The critic reads the joint
         input with the agent itself first; both tell the agents apart by a learnt bias, as by a one-hot index in the input
     :param team: learn only the agents of this group; the others act by ``opponents``
-    :param opponents: with ``team``: for each other group the name of a scripted policy, or anything with ``predict`` on
-        joint rows, such as a trained model
+    :param opponents: with ``team``: for each other group its player: the name of a scripted policy, the path of a saved model,
+        a model, or a mixture drawn anew for every episode, see :func:`~sb3_kfcv.teams.players.find_player`
     :param policy_delay: updates of the critics per update of actors and targets (TD3: 2, against chasing a poor critic)
     :param target_policy_noise: noise on the target actions (TD3: 0.2, smooths sharp peaks of the critics)
     :param target_noise_clip: bound of that noise
@@ -111,7 +105,7 @@ class MADDPG(SaveableAlgorithm):
     def __init__(
         self,
         policy: str | type[MADDPGPolicy],
-        env: GymEnv | str | Any,
+        env: gym.Env | VecEnv | str | Any,
         learning_rate: float | str | Schedule = 1e-3,
         buffer_size: int = 5000,
         learning_starts: int = 1000,
@@ -189,7 +183,7 @@ class MADDPG(SaveableAlgorithm):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        self._check_settings()
+        self.check_settings()
         layout = self.layout
         self.agents = list(layout.members(self.team) if self.team else range(layout.n_agents))
         self.n_learning_agents = len(self.agents)
@@ -198,6 +192,7 @@ class MADDPG(SaveableAlgorithm):
         agent_of_column = [i for i, size in enumerate(layout.action_sizes) for _ in range(size)]
         self._agent_of_column = th.tensor(agent_of_column, device=self.device)
         self._opponent_policy = self._make_opponent_policy()
+        self._line_up: LineUp | None = None  # who of the opponents plays in each world
         state_size = 0 if self.critic_input == "observations" else layout.state_size
         if self.action_noise is None and not layout.discrete and self.exploration_noise > 0:
             size = sum(layout.action_sizes)
@@ -234,7 +229,7 @@ class MADDPG(SaveableAlgorithm):
         rate: Any = self.learning_rate
         self.lr_schedule = FloatSchedule(schedule_of(rate) if isinstance(rate, str) else rate)
 
-    def _check_settings(self) -> None:
+    def check_settings(self) -> None:
         """Refuse what cannot train, before anything is built."""
         layout = self.layout
         if self.critic_input not in CRITIC_INPUTS:
@@ -279,7 +274,9 @@ class MADDPG(SaveableAlgorithm):
         if not self.opponents:
             example = {group: "random" for group in others}
             raise ValueError(f"team={self.team!r} needs players for the other groups, such as opponents={example}")
-        return TeamPolicy(self.layout, self.opponents or {}, np.random.default_rng(self.seed), groups=others)
+        return TeamPolicy(
+            self.layout, self.opponents, np.random.default_rng(self.seed), groups=others, action_space=self.action_space
+        )
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor
@@ -387,15 +384,13 @@ class MADDPG(SaveableAlgorithm):
         return th.cat([seen, actions * alive.index_select(1, self._agent_of_column)], dim=1)
 
     def _target_actions(self, observations: th.Tensor) -> th.Tensor:
-        """(batch, joint action): a' of all agents, the learning ones by their target actors."""
+        """(batch, joint action): a' of all agents, the learning ones by their target actors, the others as they play."""
         actions = self.policy.joint_actions(self.actor_target, observations, learning=True)
         if self.target_policy_noise > 0 and not self.layout.discrete:
             noise = th.randn_like(actions).mul_(self.target_policy_noise)
             actions = (actions + noise.clamp_(-self.target_noise_clip, self.target_noise_clip)).clamp_(-1, 1)
         if self._opponent_policy is not None:
-            rows = observations.cpu().numpy()
-            others = self._opponent_policy.fill(self.policy.to_env(actions), rows)
-            actions = self.policy.encode(th.as_tensor(self.policy.from_env(others), device=self.device))
+            actions = self._opponent_policy.expected_rows(actions, observations, self.policy)
         return actions
 
     def _follow(self, targets: nn.Module, networks: nn.Module) -> None:
@@ -431,14 +426,21 @@ class MADDPG(SaveableAlgorithm):
         The joint action row, as in SB3; with ``team``, the other groups' part comes from their opponents.
 
         :param observation: joint row (joint,) or rows (batch, joint)
-        :param state: not used
-        :param episode_start: not used
+        :param state: who of mixed opponents plays in each row: what the last call gave; ``None`` draws anew
+        :param episode_start: bool (batch,): where mixed opponents draw anew
         :param deterministic: discrete agents take their best action instead of a draw
+        :return: joint actions; and the state for the next call, ``None`` without mixed opponents
         """
-        actions, state = super().predict(observation, state, episode_start, deterministic)
-        if self._opponent_policy is not None:
-            actions = self._opponent_policy.fill(actions, np.asarray(observation), deterministic)
-        return actions, state
+        actions, _ = super().predict(observation, None, None, deterministic)
+        if self._opponent_policy is None:
+            return actions, None
+        rows = np.asarray(observation)
+        line_up = self._opponent_policy.line_up(len(np.atleast_2d(rows)), state, episode_start)
+        return self._opponent_policy.fill(actions, rows, deterministic, line_up), line_up
+
+    def greedy_rows(self, observations: th.Tensor) -> th.Tensor:
+        """Greedy actions as a critic sees them; zeros for agents that do not learn: (batch, joint action)."""
+        return self.policy.greedy_rows(observations)
 
     def predict_agent(self, agent: str, observation: np.ndarray, deterministic: bool = True) -> np.ndarray:
         """
@@ -457,14 +459,34 @@ class MADDPG(SaveableAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        noise = None if action_noise is None else OneDraw(action_noise)
-        action, buffer_action = super()._sample_action(learning_starts, noise, n_envs)
+        buffer_action = self.sample_own_action(learning_starts, action_noise, n_envs)
+        action = buffer_action if self.layout.discrete else self.policy.unscale_action(buffer_action)
         if self._opponent_policy is not None:  # neither the warm-up nor the noise is for the opponents
-            action = self._opponent_policy.fill(action, np.asarray(self._last_obs), deterministic=False)
+            self._line_up = self._opponent_policy.line_up(n_envs, self._line_up)
+            action = self._opponent_policy.fill(action, np.asarray(self._last_obs), False, self._line_up)
             buffer_action = self.policy.from_env(action)
         if not self.layout.discrete:
-            require_finite_columns("action", action, self._columns_of(self.layout.action_slices))
+            require_finite_columns("action", action, self.columns_of(self.layout.action_slices))
         return action, buffer_action
+
+    def sample_own_action(self, learning_starts: int, action_noise: ActionNoise | None, n_envs: int) -> np.ndarray:
+        """
+        What the learning agents try, as SB3 samples it, without asking any opponent.
+
+        :param learning_starts: env steps with random actions
+        :param action_noise: on continuous actions
+        :param n_envs: number of worlds
+        :return: joint actions as the replay buffer stores them (worlds, joint); the columns of all other agents mean nothing
+        """
+        if self.num_timesteps < learning_starts:
+            action = np.array([self.action_space.sample() for _ in range(n_envs)])
+        else:
+            assert self._last_obs is not None
+            action, _ = self.policy.predict(self._last_obs, deterministic=False)
+        if self.layout.discrete:
+            return action
+        scaled = self.policy.scale_action(action)
+        return scaled if action_noise is None else np.clip(scaled + OneDraw(action_noise)(), -1, 1)
 
     def _store_transition(
         self,
@@ -475,98 +497,36 @@ class MADDPG(SaveableAlgorithm):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
-        """
-        As in SB3, after a look at what came from the worlds.
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        if self._opponent_policy is not None:
+            self._line_up = self._opponent_policy.line_up(len(dones), self._line_up, dones)
 
-        :raises NonFiniteError: names the agent whose observation or reward is not finite
-        """
-        columns = self._columns_of(self.layout.obs_slices)
-        require_finite_columns("observation", np.asarray(new_obs), columns)
-        for world in np.flatnonzero(dones):
-            require_finite_columns("last observation", np.asarray(infos[world]["terminal_observation"]), columns)
-        if not math.isfinite(reward.sum()):
-            rewards = np.array([info["agent_rewards"] for info in infos])
-            require_finite_columns("reward", rewards, {name: slice(i, i + 1) for i, name in enumerate(self.layout.agents)})
-        if dones.any() or self._vec_normalize_env is not None:
-            super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)  # type: ignore[arg-type]
-        else:  # the same without a copy of all observations, in which the last ones of ended episodes would be put
-            replay_buffer.add(self._last_obs, new_obs, buffer_action, reward, dones, infos)  # type: ignore[arg-type]
-            self._last_original_obs, self._last_obs = self._last_obs, new_obs  # type: ignore[assignment]
-
-    def _columns_of(self, slices: Sequence[slice]) -> dict[str, slice]:
-        return dict(zip(self.layout.agents, slices, strict=True))
-
-    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
-        super()._update_info_buffer(infos, dones)
-        for info in infos:
-            if "episode_metrics" in info:
-                self._episode_metrics.append(info["episode_metrics"])
-
-    def dump_logs(self) -> None:
-        """Write the log: SB3's series, every episode metric of the world, the learner's and the replay's diagnostics."""
-        for key in self._episode_metrics[0] if self._episode_metrics else ():
-            self.logger.record(f"rollout/{key}", safe_mean([episode[key] for episode in self._episode_metrics]))
-        for key, value in {**self._watch.series(self.actor, self.critic), **self.replay_buffer.diagnostics()}.items():
-            self.logger.record(key, value, exclude=NOT_TENSORBOARD if isinstance(value, th.Tensor) else None)
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        with patience(self.logger):
-            super().dump_logs()
-
-    def learn(
-        self: SelfMADDPG,
-        total_timesteps: int = 100_000,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfMADDPG:
-        """
-        Learn; as in SB3, with a default length.
-
-        :param total_timesteps: env steps, summed over the worlds of the vec env
-        :param callback: called at every step
-        :param log_interval: episodes between log entries; ``None`` logs nothing
-        :param tb_log_name: name of the run in the TensorBoard folder; by default the algorithm's
-        :param reset_num_timesteps: start counting anew
-        :param progress_bar: show progress and time left
-        """
-        return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name or type(self).__name__,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
-        )
-
-    def set_env(self, env: Any, force_reset: bool = True) -> None:
-        """
-        Go on in another env, as in SB3.
-
-        :param env: whatever the constructor takes
-        :param force_reset: reset it before the next step
-        :raises ValueError: if its agents are not those that the model was made for
-        """
-        env = self._wrap_env(maybe_make_env(env, self.verbose), self.verbose)
-        if layout_of(env) != self.layout:
-            raise ValueError(f"the model is for {self.layout}; the env has {layout_of(env)}")
-        super().set_env(env, force_reset)
-        self._vec_normalize_env = unwrap_vec_normalize(env)
-        self._check_settings()
-
-    @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        return OffPolicyAlgorithm._wrap_env(wrap_env(env, monitor_wrapper), verbose, monitor_wrapper)
+    def series(self) -> dict[str, Any]:
+        return {**self._watch.series(self.actor, self.critic), **self.replay_buffer.diagnostics()}
 
     def training_state(self) -> dict[str, Any]:
         opponents = self._opponent_policy.get_state() if self._opponent_policy is not None else {}
-        return {"watch": self._watch.get_state(self.actor, self.critic), "opponents": opponents}
+        watch = self._watch.get_state(self.actor, self.critic)
+        return {"watch": watch, "opponents": opponents, "line_up": self._line_up}
 
     def set_training_state(self, saved: dict[str, Any]) -> None:
         self._watch.set_state(saved["watch"], self.device)
         if self._opponent_policy is not None:
             self._opponent_policy.set_state(saved["opponents"])
+            self._line_up = saved.get("line_up")
+
+    def attributes(self, exclude: Collection[str] = (), include: Collection[str] = ()) -> dict[str, Any]:
+        """
+        As of every model; opponents are written as they play now, so that the file needs no other one. What no file can hold
+        (an opponent that only has ``predict``) is left out, and must be given to ``load`` again.
+        """
+        attributes = super().attributes(exclude, include)
+        if self._opponent_policy is not None and "opponents" in attributes:
+            try:
+                attributes["opponents"] = self._opponent_policy.written()
+            except UnwritableError:
+                del attributes["opponents"]
+        return attributes
 
     def _excluded_save_params(self) -> list[str]:
         excluded = [
@@ -576,6 +536,7 @@ class MADDPG(SaveableAlgorithm):
             "critic_target",
             "_watch",
             "_opponent_policy",
+            "_line_up",
             "lr_schedule",
             "start_time",
         ]
@@ -587,8 +548,6 @@ class MADDPG(SaveableAlgorithm):
             "_parameters",
             "teacher_input_size",
         ]  # made anew of the settings
-        if any(not isinstance(player, str) for player in (self.opponents or {}).values()):
-            excluded.append("opponents")  # models are saved in their own files and given again to load()
         return super()._excluded_save_params() + excluded
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

@@ -17,6 +17,7 @@ from torch import nn
 from sb3_kfcv.common.checks import require_between, require_count
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.replay.joint_replay_buffer import JointReplayBuffer
+from sb3_kfcv.saving.files import is_path
 
 NEEDED = {"algorithm", "layout", "policy_class", "policy_kwargs", "observation_space", "action_space", "n_envs"}
 
@@ -45,8 +46,9 @@ def check_attributes(attributes: dict[str, Any], algorithm: type) -> None:
             raise ValueError(f"{name} is a method, no attribute")
         if name in OF_THE_PROGRAM:
             raise ValueError(f"{name} is nothing that a file can hold")
-    _check_spaces(attributes["layout"], attributes["observation_space"], attributes["action_space"])
+    check_spaces(attributes["layout"], attributes["observation_space"], attributes["action_space"])
     _check_classes(attributes)
+    _check_opponents(attributes.get("opponents"))
     _check_noise(attributes.get("action_noise"), attributes["action_space"].shape)
     require_count("n_envs", attributes["n_envs"])
     for name in COUNTERS:
@@ -73,7 +75,13 @@ def without_retired(attributes: dict[str, Any]) -> dict[str, Any]:
     return {**attributes, "replay_buffer_kwargs": kept}
 
 
-def _check_spaces(layout: Any, observations: Any, actions: Any) -> None:
+def check_spaces(layout: Any, observations: Any, actions: Any) -> None:
+    """
+    :param layout: who sits where in the joint rows
+    :param observations: joint observation space
+    :param actions: joint action space
+    :raises ValueError: unless they belong together
+    """
     if not isinstance(layout, AgentLayout):
         raise ValueError(f"the layout of the agents is {layout!r}")
     if layout.discrete:
@@ -100,6 +108,13 @@ def _check_classes(attributes: dict[str, Any]) -> None:
     ):
         if not (issubclass(thing, base) if isinstance(thing, type) else callable(thing)):
             raise ValueError(f"{name} is {thing!r}, which is no {base.__name__}")
+
+
+def _check_opponents(opponents: Any) -> None:
+    """Names of scripted policies, or what was made of the file itself: it has no say about other files."""
+    for player in (opponents or {}).values():
+        if isinstance(player, str) and is_path(player):
+            raise ValueError(f"an opponent is the file {player!r}, which is nothing that a file can say")
 
 
 def _check_noise(noise: Any, shape: tuple[int, ...]) -> None:

@@ -7,13 +7,25 @@ import pathlib
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 
 def with_suffix(path: str | pathlib.Path, suffix: str) -> pathlib.Path:
     """The path with an ending, added unless it is there (``"model"`` → ``model.zip``; ``"v1.0"`` → ``v1.0.zip``)."""
     path = pathlib.Path(path)
     return path if path.suffix == suffix else path.with_name(path.name + suffix)
+
+
+def existing(path: Any) -> Any:
+    """The path, or that with the ending ``.zip`` if there is no such file; anything else than a path as it is."""
+    if isinstance(path, (str, pathlib.Path)) and not pathlib.Path(path).is_file():
+        return with_suffix(path, ".zip")
+    return path
+
+
+def is_path(text: str) -> bool:
+    """Whether a text that may also be a name means a file: it ends in ``.zip``, or has a slash."""
+    return text.endswith(".zip") or "/" in text or os.sep in text
 
 
 @contextmanager

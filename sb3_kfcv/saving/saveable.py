@@ -20,9 +20,9 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.stacked_networks import at_most
 from sb3_kfcv.replay.joint_replay_buffer import JointReplayBuffer
-from sb3_kfcv.saving.archive import Archive, FileFormatError, Source, open_archive, write_archive
+from sb3_kfcv.saving.archive import Archive, FileFormatError, open_archive, write_archive
 from sb3_kfcv.saving.attributes import NEEDED, check_attributes, without_retired
-from sb3_kfcv.saving.files import with_suffix
+from sb3_kfcv.saving.files import existing, with_suffix
 from sb3_kfcv.saving.normalization import normalization_state
 from sb3_kfcv.saving.parameters import check_network, check_optimizer
 from sb3_kfcv.saving.transitions import packed, unpacked
@@ -153,7 +153,7 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
         :raises ValueError: if the env's agents are not those that the model was trained for
         """
         env = None if env is None else cls._wrap_env(maybe_make_env(env, 0), 0)
-        with open_archive(_existing(path), *MODEL_KINDS) as archive:
+        with open_archive(existing(path), *MODEL_KINDS) as archive:
             if print_system_info:
                 get_system_info()
                 print("saved with:", archive.manifest.get("libraries"))
@@ -211,7 +211,7 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
         if isinstance(load_path_or_dict, dict):
             super().set_parameters(load_path_or_dict, exact_match, device)
             return
-        with open_archive(_existing(load_path_or_dict), *MODEL_KINDS) as archive, refusals(archive, "parameters"):
+        with open_archive(existing(load_path_or_dict), *MODEL_KINDS) as archive, refusals(archive, "parameters"):
             super().set_parameters(self.checked_parameters(archive.read("parameters")), exact_match, device)
 
     # ---- replay buffers
@@ -258,13 +258,6 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
                 f"not a replay buffer of this model: it is a {getattr(found, '__name__', found)}, wanted is a {wanted}"
             )
         self.replay_buffer.set_state(state, transitions)
-
-
-def _existing(path: Any) -> Source:
-    """The path, or that with the ending ``.zip`` if only this exists."""
-    if isinstance(path, (str, pathlib.Path)) and not pathlib.Path(path).is_file():
-        return with_suffix(path, ".zip")
-    return path
 
 
 def _check_env(env: VecEnv, attributes: dict[str, Any], archive: Archive) -> None:

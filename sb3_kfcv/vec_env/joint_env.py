@@ -51,6 +51,7 @@ class JointEnv(gym.Env):
         )
         self._columns = dict(zip(agents, self.layout.obs_slices, strict=True))
         self._places = {agent: slice(i, i + 1) for i, agent in enumerate(agents)}
+        self.wins = dict(getattr(env, "wins", {}))
         self._weights = scalar_weights(self.layout, getattr(env, "scalar_reward", "mean") if reward == "default" else reward)
         self._world_metrics = tuple(getattr(env, "metric_names", ()))
         self.metric_names = (*self._world_metrics, *(f"return_{group}" for group in self.layout.group_names))

@@ -123,6 +123,17 @@ def layout_of(env: VecEnv) -> AgentLayout:
         ) from None
 
 
+def wins_of(env: VecEnv) -> dict[str, str]:
+    """
+    Who can win, and the episode metric that tells how far: group → name of a metric in [0, 1]. Where two groups meet and one
+    of them is named, the other one wins the rest. Empty if the world does not say; it says so by an attribute ``wins``.
+    """
+    try:
+        return dict(env.get_attr("wins", [0])[0])
+    except AttributeError:
+        return {}
+
+
 def metric_names_of(env: VecEnv) -> tuple[str, ...]:
     """Names of the episode metrics of a vec env; none if it declares none."""
     try:
