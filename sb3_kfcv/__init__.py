@@ -2,6 +2,8 @@
 
 import gymnasium as gym
 
+from sb3_kfcv.algorithms import ALGOS
+from sb3_kfcv.co_training import CoTraining
 from sb3_kfcv.curriculum import KFCVReplayBuffer
 from sb3_kfcv.envs.registration import register as register_pettingzoo_ids
 from sb3_kfcv.kfcv_maddpg import KFCVMADDPG
@@ -14,8 +16,6 @@ from sb3_kfcv.saving.normalization import load_normalization
 from sb3_kfcv.vec_env import JointEnv, ParticleVecEnv, make_vec_env
 from sb3_kfcv.vec_env.make import WORLDS
 from sb3_kfcv.version import __version__
-
-ALGOS: dict[str, type[MADDPG]] = {"maddpg": MADDPG, "per_maddpg": PERMADDPG, "kfcv_maddpg": KFCVMADDPG}
 
 register("MlpPolicy", MlpPolicy)
 for _buffer in (JointReplayBuffer, PrioritizedReplayBuffer, KFCVReplayBuffer):
@@ -31,6 +31,7 @@ __all__ = [
     "MADDPG",
     "PERMADDPG",
     "Checkpoints",
+    "CoTraining",
     "FileFormatError",
     "JointEnv",
     "KFCVReplayBuffer",

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.stacked_networks import StackedMLP, at_most
-from sb3_kfcv.saving.archive import open_archive, write_archive
+from sb3_kfcv.saving.archive import Archive, open_archive, write_archive
 from sb3_kfcv.saving.attributes import check_spaces
 from sb3_kfcv.saving.parameters import check_network
 from sb3_kfcv.saving.values import register_kind
@@ -289,10 +289,7 @@ class ActorPolicy(BasePolicy):
         :raises FileFormatError: if the file is damaged, or none of these
         """
         with open_archive(path, "player") as archive:
-            player = archive.read("player")
-            if not isinstance(player, ActorPolicy):
-                archive.refuse("holds no player")
-        return player.to(get_device(device))
+            return player_in(archive).to(get_device(device))
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self._predict(observation, deterministic=deterministic)
@@ -416,6 +413,18 @@ def make_player(parameters: dict[str, th.Tensor], **fields: Any) -> ActorPolicy:
     policy.actor.requires_grad_(False)
     policy.set_training_mode(False)
     return policy
+
+
+def player_in(archive: Archive) -> ActorPolicy:
+    """
+    The actors in an open player file.
+
+    :raises FileFormatError: if there are none
+    """
+    player = archive.read("player")
+    if not isinstance(player, ActorPolicy):
+        archive.refuse("holds no player")
+    return player
 
 
 register_kind("ActorPolicy", ActorPolicy, _fields, make_player)

@@ -95,6 +95,7 @@ class MADDPG(JointAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": MlpPolicy}
     default_buffer_class: ClassVar[type[JointReplayBuffer]] = JointReplayBuffer
+    stores_state = False  # whether the replay buffer keeps the worlds' states although this learner needs none
     policy: MADDPGPolicy
     replay_buffer: JointReplayBuffer
     actor: StackedActors
@@ -193,7 +194,8 @@ class MADDPG(JointAlgorithm):
         self._agent_of_column = th.tensor(agent_of_column, device=self.device)
         self._opponent_policy = self._make_opponent_policy()
         self._line_up: LineUp | None = None  # who of the opponents plays in each world
-        state_size = 0 if self.critic_input == "observations" else layout.state_size
+        needs_state = self.critic_input != "observations" or self.stores_state
+        state_size = layout.state_size if needs_state else 0
         if self.action_noise is None and not layout.discrete and self.exploration_noise > 0:
             size = sum(layout.action_sizes)
             self.action_noise = NormalActionNoise(np.zeros(size), np.full(size, self.exploration_noise), dtype=np.float32)
@@ -523,7 +525,7 @@ class MADDPG(JointAlgorithm):
         attributes = super().attributes(exclude, include)
         if self._opponent_policy is not None and "opponents" in attributes:
             try:
-                attributes["opponents"] = self._opponent_policy.written()
+                attributes["opponents"] = self._opponent_policy.written(self._opponent_policy.players)
             except UnwritableError:
                 del attributes["opponents"]
         return attributes

@@ -38,7 +38,7 @@ from sb3_kfcv.saving.run_state import (
     set_log_state,
     set_random_state,
 )
-from sb3_kfcv.saving.saveable import SaveableAlgorithm, refusals
+from sb3_kfcv.saving.saveable import SaveableAlgorithm, further_sections, refusals
 from sb3_kfcv.saving.transitions import packed, unpacked
 from sb3_kfcv.saving.values import check_writable, encode
 
@@ -107,6 +107,7 @@ class Checkpoint:
             self.parameters: dict[str, Any] = archive.read("parameters")
             self.replay_buffer: dict[str, Any] = archive.read("replay_buffer")
             self.training: dict[str, Any] = archive.read("training")
+            self.further = further_sections(archive)
             with refusals(archive, "training"):
                 self.pieces = [Piece(**piece) for piece in self.training["transitions"]]
                 self.steps = int(self.attributes["num_timesteps"])
@@ -373,6 +374,8 @@ class Checkpoints(BaseCallback):
             none_yet = model.replay_buffer.transitions(model.replay_buffer.n_added)
             model.set_replay_buffer_state(checkpoint.replay_buffer, checkpoint.transitions or none_yet)
         vars(model).update(attributes)
+        with refusals(checkpoint, "attributes"):
+            model.take_sections(checkpoint.further)
         self._pieces = self._pieces_of[checkpoint.path] = checkpoint.pieces
         self.last_path = checkpoint.path
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import pathlib
 import warnings
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, ClassVar, NoReturn, Protocol, TypeVar
 
@@ -32,6 +32,9 @@ from sb3_kfcv.vec_env.make import layout_of
 SelfSaveable = TypeVar("SelfSaveable", bound="SaveableAlgorithm")
 
 MODEL_KINDS = ("model", "checkpoint")
+
+# Sections that only the files of some algorithms have: the attributes of several learners.
+FURTHER_SECTIONS = ("teams",)
 
 # What comes of values that do not fit where they are put.
 WRONG_VALUES = (
@@ -109,6 +112,14 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
     def set_training_state(self, saved: dict[str, Any]) -> None:
         """Inverse of :meth:`training_state`."""
 
+    def take_sections(self, sections: Mapping[str, Any]) -> None:
+        """
+        Take over what an algorithm's file has beside attributes, parameters and what every kind of file has.
+
+        :param sections: those of ``FURTHER_SECTIONS`` that the file has, by name
+        :raises ValueError: if they do not fit
+        """
+
     # ---- models
 
     def save(
@@ -168,7 +179,8 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
                 check_attributes(attributes, cls)
             with refusals(archive, "parameters"):
                 parameters = archive.read("parameters")
-                n_weights = sum(tensor.numel() for tensor in parameters["policy"].values())
+                networks = [saved for name, saved in parameters.items() if not name.endswith("optimizer")]
+                n_weights = sum(tensor.numel() for saved in networks for tensor in saved.values())
             if env is not None and "normalization" in archive and unwrap_vec_normalize(env) is None:
                 warnings.warn(f"{archive.name} was trained with normalised observations; wrap its env by load_normalization()")
             if env is not None:
@@ -189,6 +201,7 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
                 if isinstance(model.action_noise, VectorizedActionNoise):  # made by learn() for the env's number of worlds
                     model.action_noise = model.action_noise.base_noise
                 model._setup_model()
+                model.take_sections(further_sections(archive))
             with refusals(archive, "parameters"):
                 OffPolicyAlgorithm.set_parameters(model, model.checked_parameters(parameters), device=device)
         return model
@@ -258,6 +271,11 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
                 f"not a replay buffer of this model: it is a {getattr(found, '__name__', found)}, wanted is a {wanted}"
             )
         self.replay_buffer.set_state(state, transitions)
+
+
+def further_sections(archive: Archive) -> dict[str, Any]:
+    """Those of ``FURTHER_SECTIONS`` that a file has, by name."""
+    return {name: archive.read(name) for name in FURTHER_SECTIONS if name in archive}
 
 
 def _check_env(env: VecEnv, attributes: dict[str, Any], archive: Archive) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from torch import nn
 
-from sb3_kfcv.common.actors import ActorPolicy, hidden_sizes, make_player
+from sb3_kfcv.common.actors import ActorPolicy, hidden_sizes, make_player, player_in
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.envs.scripted import SCRIPTED_POLICIES, ScriptedPolicy, scripted_policy
@@ -93,17 +93,16 @@ class Mixture:
 
 
 def _make_mixture(players: list[Any], weights: np.ndarray) -> Mixture:
-    if type(players) is not list or any(
-        not isinstance(player, ActorPolicy) and (type(player) is not str or is_path(player)) for player in players
-    ):
-        raise ValueError("the players of a mixture are names of scripted policies, or players")
+    named = [player for player in players if not isinstance(player, ActorPolicy)]
+    if any(type(name) is not str or is_path(name) for name in named):
+        raise ValueError(f"the players of a mixture are names of scripted policies, or players; got {named}")
     return Mixture(players, weights)
 
 
 register_kind(
     "Mixture",
     Mixture,
-    lambda mixture: {"players": [written(player) for player in mixture.players], "weights": mixture.weights},
+    lambda mixture: {"players": mixture.players, "weights": mixture.weights},
     _make_mixture,
 )
 
@@ -200,15 +199,12 @@ def load_player(path: str | os.PathLike[str], group: str | None = None) -> Actor
     :raises FileFormatError: if the file is damaged, or of another kind
     :raises ValueError: if there is no such file, or none of its learners plays the group
     """
-    path = existing(Path(path))
-    if not path.is_file():
-        raise ValueError(f"there is no file {path} to take a player of")
-    with open_archive(path, *PLAYER_KINDS) as archive:
+    file: Path = existing(Path(path))
+    if not file.is_file():
+        raise ValueError(f"there is no file {file} to take a player of")
+    with open_archive(file, *PLAYER_KINDS) as archive:
         if archive.kind == "player":
-            player = archive.read("player")
-            if not isinstance(player, ActorPolicy):
-                archive.refuse("holds no player")
-            return player
+            return player_in(archive)
         with refusals(archive, "attributes"):
             attributes = without_retired(archive.read("attributes"))
             of_learner = "policy"
@@ -242,8 +238,10 @@ def written(player: Any) -> Any:
 
     :raises UnwritableError: for anything else
     """
-    if isinstance(player, str | Mixture):
+    if isinstance(player, str):
         return player
+    if isinstance(player, Mixture):
+        return Mixture([written(one) for one in player.players], player.weights)
     if isinstance(player, ScriptedPolicy):
         for name, scripted in SCRIPTED_POLICIES.get(player.group, {}).items():
             if type(player) is scripted:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -52,7 +52,7 @@ class TeamPolicy:
         self.players: dict[str, Player] = {
             group: find_player(player, layout, group, self.rng, action_space, **facts) for group, player in players.items()
         }
-        self._columns = {group: self._action_columns(group) for group in wanted}
+        self.columns = {group: self._action_columns(group) for group in wanted}
         self._critic_columns = {group: _columns(layout, group) for group in wanted}
         self._mixtures = {group: player for group, player in self.players.items() if isinstance(player, Mixture)}
 
@@ -100,7 +100,12 @@ class TeamPolicy:
         return tuple(drawn)
 
     def fill(
-        self, actions: np.ndarray, observation: np.ndarray, deterministic: bool = True, line_up: LineUp | None = None
+        self,
+        actions: np.ndarray,
+        observation: np.ndarray,
+        deterministic: bool = True,
+        line_up: LineUp | None = None,
+        without: Sequence[Any] = (),
     ) -> np.ndarray:
         """
         A joint action with the columns of the groups played here replaced.
@@ -109,20 +114,26 @@ class TeamPolicy:
         :param observation: joint rows (B, joint), or one of them
         :param deterministic: passed on to the models
         :param line_up: who of each mixture plays; by default drawn anew
+        :param without: players whose actions are left as they are
         :return: joint actions of the same shape
         """
         rows = np.atleast_2d(observation)
         filled = np.array(np.atleast_2d(actions))
-        playing = dict(zip(self._mixtures, line_up or self.line_up(len(rows)) or (), strict=True))
+        playing = self.playing(line_up or self.line_up(len(rows)))
         for group, player in self.players.items():
-            columns = self._columns[group]
+            columns = self.columns[group]
             if isinstance(player, Mixture):
                 for i in np.unique(playing[group]):
-                    own = np.flatnonzero(playing[group] == i)
-                    filled[np.ix_(own, columns)] = self._actions(player.players[i], columns, rows[own], deterministic)
-            else:
+                    if player.players[i] not in without:
+                        own = np.flatnonzero(playing[group] == i)
+                        filled[np.ix_(own, columns)] = self._actions(player.players[i], columns, rows[own], deterministic)
+            elif player not in without:
                 filled[:, columns] = self._actions(player, columns, rows, deterministic)
         return filled.reshape(np.shape(actions))
+
+    def playing(self, line_up: LineUp | None) -> dict[str, np.ndarray]:
+        """Who plays in each row, by group, of the groups that mixtures play."""
+        return dict(zip(self._mixtures, line_up or (), strict=True))
 
     def expected_rows(self, actions: th.Tensor, observations: th.Tensor, policy: ActorPolicy) -> th.Tensor:
         """
@@ -152,17 +163,17 @@ class TeamPolicy:
         """What one player does, as a critic sees it, in its columns of (batch, joint action)."""
         if hasattr(player, "greedy_rows"):
             return player.greedy_rows(observations)
-        taken, columns = policy.to_env(actions), self._columns[group]
+        taken, columns = policy.to_env(actions), self.columns[group]
         taken[:, columns] = self._actions(player, columns, observations.cpu().numpy(), deterministic=True)
         return policy.encode(th.as_tensor(policy.from_env(taken), device=actions.device))
 
-    def written(self) -> dict[str, Any]:
+    def written(self, groups: Iterable[str]) -> dict[str, Any]:
         """
-        The players as a file can hold them.
+        The players of some groups as a file can hold them.
 
         :raises UnwritableError: if one is of a kind that no file holds
         """
-        return {group: written(player) for group, player in self.players.items()}
+        return {group: written(self.players[group]) for group in groups}
 
     def get_state(self) -> dict[str, Any]:
         """The random generators of the players, by group; and under ``""`` that of the mixtures."""
