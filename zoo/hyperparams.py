@@ -12,7 +12,8 @@ import gymnasium as gym
 import yaml
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_kfcv import ALGOS
+from sb3_kfcv import ALGOS, CoTraining
+from sb3_kfcv.common.joint_algorithm import JointAlgorithm
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.schedules import schedule_of
 from sb3_kfcv.maddpg import MADDPG
@@ -22,6 +23,10 @@ from zoo.typed_settings import checked, resolve_classes, settings_of
 
 HYPERPARAMS = Path(__file__).parents[1] / "hyperparams"
 PRESETS = ("default", "tuned")
+
+# Several teams, each with an algorithm of its own.
+CO_TRAINING = "co_training"
+ALGORITHMS: dict[str, type[MADDPG] | type[CoTraining]] = {**ALGOS, CO_TRAINING: CoTraining}
 
 # Constructor arguments that are flags of the command line, or not for a file to say.
 FLAGS = ("seed", "device", "verbose", "tensorboard_log")
@@ -83,20 +88,46 @@ class Hyperparams:
         :param names: only these; all by default
         """
         kwargs = deepcopy({name: self.model[name] for name in (self.model if names is None else names)})
-        if isinstance(kwargs.get("train_freq"), list):
-            kwargs["train_freq"] = tuple(kwargs["train_freq"])
-        if "policy_kwargs" in kwargs:
-            kwargs["policy_kwargs"] = resolve_classes(kwargs["policy_kwargs"], _policy_settings(self.algo, self.policy))
-        return kwargs
+        if self.algo != CO_TRAINING:
+            return _constructor_kwargs(self.algo, self.policy, kwargs)
+        teams = {team: _constructor_kwargs(theirs["algo"], self.policy, theirs) for team, theirs in kwargs["teams"].items()}
+        return {**kwargs, "teams": teams}
 
 
-def find_algorithm(name: str) -> type[MADDPG]:
+def _constructor_kwargs(algo: str, policy: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    kwargs = dict(settings)
+    if isinstance(kwargs.get("train_freq"), list):
+        kwargs["train_freq"] = tuple(kwargs["train_freq"])
+    if "policy_kwargs" in kwargs:
+        kwargs["policy_kwargs"] = resolve_classes(kwargs["policy_kwargs"], _policy_settings(algo, policy))
+    return kwargs
+
+
+def find_algorithm(name: str) -> Any:
     """
+    :return: a class of :class:`MADDPG`, or :class:`CoTraining`
     :raises ValueError: for an unknown algorithm, with the nearest one
     """
-    if name not in ALGOS:
-        raise ValueError(unknown_name("algorithm", name, ALGOS))
-    return ALGOS[name]
+    if name not in ALGORITHMS:
+        raise ValueError(unknown_name("algorithm", name, ALGORITHMS))
+    return ALGORITHMS[name]
+
+
+def co_training_entry(entries: Mapping[str, Mapping[str, Any]], algos: Mapping[str, str]) -> dict[str, Any]:
+    """
+    The entry of several teams, of those of their algorithms.
+
+    :param entries: team → the entry of a world in the YAML file of its algorithm
+    :param algos: team → its algorithm
+    :raises ValueError: if they do not agree about what is the run's
+    """
+    of_the_run: dict[str, Any] = {}
+    for team, entry in entries.items():
+        for name in OF_THE_RUN:
+            if name in entry and of_the_run.setdefault(name, entry[name]) != entry[name]:
+                raise ValueError(f"{name} is {of_the_run[name]} for {next(iter(entries))} and {entry[name]} for {team}")
+    own = {team: {name: value for name, value in entry.items() if name not in OF_THE_RUN} for team, entry in entries.items()}
+    return {**of_the_run, "teams": {team: {"algo": algos[team], **own[team]} for team in entries}}
 
 
 def load_entry(algo: str, env_id: str, conf_file: str | Path | None = None, preset: str = "default") -> dict[str, Any]:
@@ -175,8 +206,7 @@ def check(algo: str, env_id: str, entry: Mapping[str, Any]) -> Hyperparams:
             raise ValueError(f"{flag} is no hyperparameter: give it with --{flag.replace('_', '-')}")
     if "norm_reward" in entry:
         raise ValueError(_norm_reward_refusal())
-    of_the_model = {**settings_of(algorithm, NOT_SETTABLE), "learning_rate": float | str}  # text for a schedule
-    settings = checked("hyperparameter", entry, {**OF_THE_RUN, **of_the_model})
+    settings = checked("hyperparameter", entry, {**OF_THE_RUN, **_model_settings(algorithm)})
     run = {name: settings.pop(name) for name in OF_THE_RUN if name in settings}
     for name in ("n_timesteps", "n_envs"):
         if name not in run:
@@ -187,17 +217,38 @@ def check(algo: str, env_id: str, entry: Mapping[str, Any]) -> Hyperparams:
     run["env_kwargs"] = check_env_kwargs(env_id, run.get("env_kwargs", {}))
     if run.setdefault("policy", "MlpPolicy") not in algorithm.policy_aliases:
         raise ValueError(unknown_name("policy", run["policy"], algorithm.policy_aliases))
+    if algo != CO_TRAINING:
+        return Hyperparams(algo, env_id, model=_checked_model(algo, run["policy"], settings), **run)
+    teams = {}
+    for team, theirs in settings.get("teams", {}).items():
+        if not isinstance(theirs, dict) or theirs.get("algo") not in ALGOS:
+            known = ", ".join(ALGOS)
+            raise ValueError(f"hyperparameter teams: {team} is {theirs!r}; it must be a map with an algo, one of {known}")
+        known_settings = _model_settings(ALGOS[theirs["algo"]], (*NOT_SETTABLE, "team", "opponents", "stats_window_size"))
+        own = checked(f"hyperparameter of {team},", theirs, {"algo": str, **known_settings})
+        teams[team] = {"algo": own.pop("algo"), **_checked_model(theirs["algo"], run["policy"], own)}
+    return Hyperparams(algo, env_id, model={**settings, "teams": teams}, **run)
+
+
+def _model_settings(algorithm: type[JointAlgorithm], without: Sequence[str] = NOT_SETTABLE) -> dict[str, Any]:
+    known = settings_of(algorithm, without)
+    return {**known, "learning_rate": float | str} if "learning_rate" in known else known  # text for a schedule
+
+
+def _checked_model(algo: str, policy: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of one learner, with those of its policy and its replay buffer checked."""
+    algorithm, checked_settings = ALGOS[algo], dict(settings)
     if isinstance(settings.get("learning_rate"), str):
         schedule_of(settings["learning_rate"])
-    settings["policy_kwargs"] = checked(
-        "setting of policy_kwargs", settings.get("policy_kwargs") or {}, _policy_settings(algo, run["policy"])
+    checked_settings["policy_kwargs"] = checked(
+        "setting of policy_kwargs", settings.get("policy_kwargs") or {}, _policy_settings(algo, policy)
     )
-    settings["replay_buffer_kwargs"] = checked(
+    checked_settings["replay_buffer_kwargs"] = checked(
         f"setting of replay_buffer_kwargs ({algorithm.default_buffer_class.__name__})",
         settings.get("replay_buffer_kwargs") or {},
         settings_of(algorithm.default_buffer_class, GIVEN_TO_BUFFER),
     )
-    return Hyperparams(algo, env_id, model=settings, **run)
+    return checked_settings
 
 
 def check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,7 +15,8 @@ from filelock import FileLock, Timeout
 
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.saving.archive import library_versions
-from sb3_kfcv.saving.files import atomic_write
+from sb3_kfcv.saving.checkpoints import checkpoints_in
+from sb3_kfcv.saving.files import atomic_write, existing
 
 
 @dataclass(frozen=True)
@@ -25,10 +26,13 @@ class RunFolder:
 
         <env>.zip                  the model at the end of training
         best_model.zip             the model of the best evaluation
+        best_<team>.zip            of a team that is measured by a yardstick: its learner at its best
+        players/                   <team>_<N>_steps.zip: the actors alone, for matches
         rl_model_<N>_steps.zip     the latest checkpoints, from which the run can be resumed; models, too
         transitions/               what their replay buffers hold
         replay_buffer.zip          the replay buffer at the end, if it was to be saved
         evaluations.npz            every episode of every evaluation
+        evaluations_<name>.npz     the same against a yardstick, such as wolf_vs_graze
         0.monitor.csv              every training episode
         events.out.tfevents.*      TensorBoard
         <env>/config.yml           the settings, resolved
@@ -109,6 +113,10 @@ class RunFolder:
         return self.path / f"{file_name(self.env_id)}.zip"
 
     @property
+    def players(self) -> Path:
+        return self.path / "players"
+
+    @property
     def replay_buffer(self) -> Path:
         return self.path / "replay_buffer.zip"
 
@@ -146,6 +154,26 @@ class RunFolder:
         """Libraries that have another version than when the run was begun, each as ``torch 2.12.0 → 2.13.0``."""
         then, now = json.loads(self.config_file.with_name("versions.json").read_text()), library_versions()
         return [f"{name} {then.get(name)} → {found}" for name, found in now.items() if then.get(name) != found]
+
+
+def file_to_play(path: str | Path) -> Path:
+    """
+    The file that a path means as a player: the file itself; of a run folder the last model, else the latest checkpoint.
+
+    :raises ValueError: if there is none
+    """
+    file: Path = existing(Path(path))
+    if file.is_file():
+        return file
+    if not Path(path).is_dir():
+        raise ValueError(f"there is no file {path} to take a player of")
+    folder = RunFolder.existing(path)
+    if folder.last_model.is_file():
+        return folder.last_model
+    checkpoints = [*checkpoints_in(folder.path).values()]
+    if not checkpoints:
+        raise ValueError(f"the run in {folder.path} has no model and no checkpoint yet")
+    return checkpoints[0]
 
 
 def file_name(env_id: str) -> str:

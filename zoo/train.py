@@ -12,7 +12,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -26,25 +26,32 @@ from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import each other as the package ``zoo``
 
-from sb3_kfcv.common.callbacks import MultiAgentEvalCallback, StopOnSignal
+from sb3_kfcv import CoTraining
+from sb3_kfcv.common.callbacks import MultiAgentEvalCallback, SavePlayers, StopOnSignal
 from sb3_kfcv.common.checks import NonFiniteError
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.patient_logs import PatientResultsWriter
 from sb3_kfcv.maddpg import MADDPG
 from sb3_kfcv.saving.checkpoints import Checkpoints, ResumeError, checkpoints_in, latest_checkpoint
 from sb3_kfcv.saving.normalization import load_normalization
+from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import layout_of, make_vec_env, metric_names_of
 from zoo.hyperparams import (
+    CO_TRAINING,
+    OF_THE_RUN,
     PRESETS,
     Hyperparams,
     check,
     check_env_kwargs,
+    co_training_entry,
     find_algorithm,
     load_entry,
     merged,
     parse_pairs,
 )
 from zoo.run_folder import RunFolder, file_name, read_map
+from zoo.teams import Teams, Yardstick, parse_teams, with_teams, yardsticks
+from zoo.typed_settings import settings_of
 
 BAD_INPUT = 2  # exit status, as of argparse
 NOT_FINITE = 3  # a loss, reward, observation or action was infinite or NaN
@@ -59,6 +66,9 @@ EVAL_SEED_OFFSET = 1_000_000
 
 # Without --log-interval: log once per so many episodes of each world.
 EPISODES_PER_LOG = 4
+
+# Without --player-freq: a team's players are saved every so many env steps.
+PLAYER_FREQ = 25_000
 
 # Flags that may stand beside --resume; all else is as the run was begun.
 FREE_WHEN_RESUMED = ("resume", "progress", "verbose")
@@ -122,8 +132,25 @@ def make_parser() -> Parser:
     add("-conf", "--conf-file", help="YAML file of hyperparameters (default: hyperparams/<algo>.yml)")
     add("--preset", help=f"{' or '.join(PRESETS)}: what learns better in place of the paper's values")
     add("-i", "--trained-agent", help="a saved model to train on in a new run, with the replay_buffer.zip beside it if any")
-    add("--team", help="learn only this group of agents")
-    add("--opponents", **{**pairs, "metavar": "GROUP:NAME"}, help="scripted policy of each other group, such as sheep:flee")
+    teams: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
+    add(
+        "--team",
+        **{**teams, "metavar": "GROUP=WHO"},
+        help="who learns a group (wolf=kfcv_maddpg) or plays it (sheep=graze, sheep=MODEL.zip, a mixture sheep=graze,flee);"
+        " several that learn train at once, against each other",
+    )
+    add("--opponents", **{**pairs, "metavar": "GROUP:NAME"}, help="the same as GROUP=NAME after --team")
+    add(
+        "--yardstick",
+        **{**teams, "metavar": "GROUP=WHO"},
+        help="fixed opponents that evaluations are against, beside those of the training "
+        "(default: the scripted policies, where teams learn against each other)",
+    )
+    add(
+        "--player-freq",
+        type=whole_number,
+        help="env steps between the players saved for matches, -1: none (default: 25000 with --team, else none)",
+    )
     add("--num-threads", type=int, default=1, help="threads of PyTorch (default: %(default)s)")
     add("--device", type=device, default="auto", help="auto, cpu, cuda (default: %(default)s)")
     add("--verbose", type=int, default=1, help="0: quiet, 1: info (default: %(default)s)")
@@ -159,13 +186,22 @@ class Training:
     :param model: the learner
     :param eval_env: worlds of the evaluation; ``None`` without evaluations
     :param n_timesteps: env steps to go, from the start or from the model of ``-i``
+    :param yardsticks: fixed opponents of the evaluation
     """
 
     args: argparse.Namespace
     hyperparams: Hyperparams
-    model: MADDPG
+    model: MADDPG | CoTraining
     eval_env: VecEnv | None
     n_timesteps: int
+    yardsticks: list[Yardstick] = field(default_factory=list)
+
+    @property
+    def player_freq(self) -> int:
+        """Env steps between saved players; −1 for none."""
+        if self.args.player_freq is not None:
+            return self.args.player_freq
+        return PLAYER_FREQ if self.args.team else -1
 
 
 def resolve(args: argparse.Namespace) -> Hyperparams:
@@ -174,8 +210,14 @@ def resolve(args: argparse.Namespace) -> Hyperparams:
 
     :raises ValueError: for whatever is unknown or of another type
     """
+    teams = parse_teams(args.team)
+    teams.players.update(parse_pairs("--opponents", args.opponents))
+    if len(teams.learners) > 1:
+        args.algo = CO_TRAINING
+    elif teams.learners:
+        args.algo = next(iter(teams.learners.values())) or args.algo
     find_algorithm(args.algo)
-    entry = load_entry(args.algo, args.env, args.conf_file, args.preset or "default")
+    entry = {} if args.trained_agent else begun_entry(args, teams)
     if args.trained_agent:
         model_path = Path(args.trained_agent)
         if not model_path.is_file():
@@ -187,15 +229,38 @@ def resolve(args: argparse.Namespace) -> Hyperparams:
             if args.preset or args.conf_file:
                 raise ValueError(f"a continued run keeps its settings ({config}); change single ones with -params")
             entry = read_map(config)
-    entry = merged(entry, parse_pairs("-params", args.hyperparams))
+        else:
+            entry = begun_entry(args, teams)
+    pairs = parse_pairs("-params", args.hyperparams)
+    if args.algo == CO_TRAINING:
+        entry = with_teams(entry, pairs, [*OF_THE_RUN, *settings_of(CoTraining)])
+    else:
+        entry = merged(entry, pairs)
+        entry.update([("team", team) for team in teams.learners])
     entry = merged(entry, {"env_kwargs": parse_pairs("--env-kwargs", args.env_kwargs)})
-    if args.team:
-        entry["team"] = args.team
-    if args.opponents:
-        entry["opponents"] = parse_pairs("--opponents", args.opponents)
+    if teams.players:
+        entry["opponents"] = {**(entry.get("opponents") or {}), **teams.players}
     if args.n_timesteps != -1 and not args.trained_agent:
         entry["n_timesteps"] = args.n_timesteps
     return check(args.algo, args.env, entry)
+
+
+def begun_entry(args: argparse.Namespace, teams: Teams) -> dict[str, Any]:
+    """
+    The entry of the YAML file: of the algorithm, or of each team's.
+
+    :param args: the command line
+    :param teams: what it says of teams
+    :raises ValueError: if there is none, or if those of the teams do not go together
+    """
+    preset = args.preset or "default"
+    if args.algo != CO_TRAINING or (args.conf_file and not teams.learners):
+        return load_entry(args.algo, args.env, args.conf_file, preset)
+    if not teams.learners:
+        raise ValueError(f"--algo {CO_TRAINING} needs teams, such as --team wolf=kfcv_maddpg sheep=maddpg")
+    algos = {team: algo or make_parser().get_default("algo") for team, algo in teams.learners.items()}
+    entries = {team: load_entry(algo, args.env, args.conf_file, preset) for team, algo in algos.items()}
+    return co_training_entry(entries, algos)
 
 
 def continue_as_begun(args: argparse.Namespace, model_path: Path) -> None:
@@ -275,6 +340,29 @@ def make_eval_env(args: argparse.Namespace, hyperparams: Hyperparams, env: VecEn
     return eval_env
 
 
+def make_yardsticks(args: argparse.Namespace, hyperparams: Hyperparams, eval_env: VecEnv | None) -> list[Yardstick]:
+    """
+    Fixed opponents of the evaluation.
+
+    :param args: the command line
+    :param hyperparams: the settings
+    :param eval_env: its worlds, if there are any
+    :raises ValueError: for one that cannot play
+    """
+    team = hyperparams.model.get("team")
+    learners = list(hyperparams.model.get("teams", [team] if team else []))
+    if not learners and args.yardstick:
+        raise ValueError("--yardstick measures a team; say which one learns with --team")
+    if eval_env is None or not learners:
+        return []
+    layout = layout_of(eval_env)
+    found = yardsticks(args.yardstick, layout, learners, default=args.algo == CO_TRAINING)
+    for team, _, opponents in found:
+        others = [group for group in layout.group_names if group != team]
+        TeamPolicy(layout, opponents, groups=others, action_space=eval_env.action_space)  # refuses who cannot play
+    return found
+
+
 def build(args: argparse.Namespace, resumed: RunFolder | None = None) -> Training:
     """
     Everything that can be refused, before anything is written.
@@ -289,21 +377,26 @@ def build(args: argparse.Namespace, resumed: RunFolder | None = None) -> Trainin
         raise ValueError(f"--save-freq is {args.save_freq}; it must be at least 1, or -1")
     if args.keep_checkpoints == 0:
         raise ValueError("--keep-checkpoints is 0; it must be at least 1, or -1 to keep all")
+    if args.player_freq is not None and args.player_freq < 1 and args.player_freq != -1:
+        raise ValueError(f"--player-freq is {args.player_freq}; it must be at least 1, or -1")
     hyperparams = check(args.algo, args.env, read_map(resumed.config_file)) if resumed else resolve(args)
     th.set_num_threads(args.num_threads)
     if args.seed < 0:
         args.seed = int(np.random.default_rng().integers(2**31))
     env = make_env(hyperparams, hyperparams.n_envs, args.seed, hyperparams.env_kwargs, training=True)
     eval_env = make_eval_env(args, hyperparams, env)
+    measured = make_yardsticks(args, hyperparams, eval_env)
     algorithm = find_algorithm(args.algo)
     settings = {**hyperparams.model_kwargs(), "seed": args.seed, "device": args.device, "verbose": args.verbose}
     if not args.trained_agent or (resumed and checkpoints_in(resumed.path)):
         model = algorithm(hyperparams.policy, env, **settings)
-        return Training(args, hyperparams, model, eval_env, hyperparams.n_timesteps)
+        return Training(args, hyperparams, model, eval_env, hyperparams.n_timesteps, measured)
 
     if isinstance(env, VecNormalize):
         env = load_normalization(args.trained_agent, env.venv, training=True)
-    model = algorithm.load(args.trained_agent, env, replay_buffer_class=algorithm.default_buffer_class, **settings)
+    if args.algo != CO_TRAINING:
+        settings["replay_buffer_class"] = algorithm.default_buffer_class
+    model = algorithm.load(args.trained_agent, env, **settings)
     buffer_file = RunFolder.of_model(args.trained_agent, args.env).replay_buffer
     if buffer_file.exists():
         model.load_replay_buffer(buffer_file)
@@ -314,7 +407,7 @@ def build(args: argparse.Namespace, resumed: RunFolder | None = None) -> Trainin
     if to_go <= 0:
         raise ValueError(f"{args.trained_agent} has its {model.num_timesteps} env steps already; say with -n how many more")
     hyperparams.n_timesteps = model.num_timesteps + to_go
-    return Training(args, hyperparams, model, eval_env, to_go)
+    return Training(args, hyperparams, model, eval_env, to_go, measured)
 
 
 def make_callbacks(training: Training, folder: RunFolder, stop: StopOnSignal) -> list[BaseCallback]:
@@ -332,11 +425,32 @@ def make_callbacks(training: Training, folder: RunFolder, stop: StopOnSignal) ->
                 args.eval_freq,
                 args.eval_episodes,
                 log_path=folder.path,
-                best_model_save_path=folder.path,
+                best_model_save_path=folder.path if args.algo != CO_TRAINING else None,
                 verbose=args.verbose,
             )
         )
+        callbacks += [
+            MultiAgentEvalCallback(
+                training.eval_env,
+                args.eval_freq,
+                args.eval_episodes,
+                log_path=folder.path,
+                best_model_save_path=folder.path if is_first_of_its_team(yardstick, training.yardsticks) else None,
+                team=yardstick.team,
+                opponents=yardstick.opponents,
+                name=yardstick.name,
+                verbose=args.verbose,
+            )
+            for yardstick in training.yardsticks
+        ]
+    if training.player_freq > 0:
+        callbacks.append(SavePlayers(folder.players, training.player_freq))
     return callbacks
+
+
+def is_first_of_its_team(yardstick: Yardstick, all_of_them: Sequence[Yardstick]) -> bool:
+    """Whether it is the one that tells a team's best model."""
+    return next(other for other in all_of_them if other.team == yardstick.team) is yardstick
 
 
 def start_logs(training: Training, folder: RunFolder) -> None:

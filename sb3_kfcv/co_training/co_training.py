@@ -89,7 +89,7 @@ class CoTraining(JointAlgorithm):
         self,
         policy: str | type[MADDPGPolicy],
         env: gym.Env | VecEnv | str | Any,
-        teams: Mapping[str, Any] | None = None,
+        teams: dict[str, Any] | None = None,
         opponents: dict[str, Any] | None = None,
         pool_share: float = 0.0,
         pool_freq: int = 25_000,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -13,9 +14,13 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from sb3_kfcv.common.actors import ActorPolicy
 from sb3_kfcv.common.evaluation import evaluate, with_interval
 from sb3_kfcv.common.patient_logs import patience
 from sb3_kfcv.saving.files import atomic_write, going_on
+from sb3_kfcv.teams.players import JointModel
+from sb3_kfcv.teams.team_policy import TeamPolicy
+from sb3_kfcv.vec_env.make import layout_of
 
 
 class MultiAgentEvalCallback(EventCallback):
@@ -33,10 +38,16 @@ class MultiAgentEvalCallback(EventCallback):
     :param best_model_save_path: folder of ``best_model.zip``, the model with the highest mean reward; ``None`` keeps none
     :param deterministic: evaluate without exploration
     :param eval_at_start: evaluate also before the first step
+    :param team: evaluate only what the model learns for this group, against ``opponents``: a yardstick that does not move,
+        while the reward against others that learn says little. The best model is then the one with the highest return of the
+        group, kept as ``best_<team>.zip``: the team's own learner, where several learn
+    :param opponents: with ``team``: who plays each other group, see :func:`~sb3_kfcv.teams.players.find_player`
+    :param name: what it logs under, in place of ``eval``; another one also writes to ``evaluations_<name>.npz``
     :param callback_after_eval: called after each evaluation
     :param verbose: 1 prints the results
     """
 
+    model: Any
     KEPT = ("n_calls", "best_mean_reward", "last_mean_reward", "timesteps", "_next")
 
     def __init__(
@@ -48,10 +59,15 @@ class MultiAgentEvalCallback(EventCallback):
         best_model_save_path: str | Path | None = None,
         deterministic: bool = True,
         eval_at_start: bool = False,
+        team: str | None = None,
+        opponents: Mapping[str, Any] | None = None,
+        name: str = "eval",
         callback_after_eval: BaseCallback | None = None,
         verbose: int = 1,
     ) -> None:
         super().__init__(callback_after_eval, verbose)
+        self.team, self.name = team, name
+        self.yardstick = self._yardstick(eval_env, opponents or {}) if team is not None else None
         self.eval_env = eval_env
         self.eval_freq = eval_freq
         self.n_eval_episodes = n_eval_episodes
@@ -63,6 +79,13 @@ class MultiAgentEvalCallback(EventCallback):
         self.last_mean_reward = -np.inf
         self.timesteps: list[int] = []
         self.evaluations: list[dict[str, np.ndarray]] = []
+
+    def _yardstick(self, eval_env: VecEnv, opponents: Mapping[str, Any]) -> TeamPolicy:
+        """The players of the other groups, and a place for the model's."""
+        layout = layout_of(eval_env)
+        layout.members(str(self.team))
+        others = [group for group in layout.group_names if group != self.team]
+        return TeamPolicy(layout, opponents, np.random.default_rng(0), others, eval_env.action_space)
 
     def _on_training_start(self) -> None:
         self._next = _next_multiple(self.eval_freq, self.num_timesteps)
@@ -80,17 +103,24 @@ class MultiAgentEvalCallback(EventCallback):
         """Evaluate the model as it is now: log, write, and keep it if it is the best."""
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
-        episodes = evaluate(self.model, self.eval_env, self.n_eval_episodes, self.deterministic)
+        episodes = evaluate(self._player(), self.eval_env, self.n_eval_episodes, self.deterministic)
         self.timesteps.append(self.num_timesteps)
         self.evaluations.append(episodes)
         self._write()
         self._log(episodes)
-        self.last_mean_reward = float(episodes["reward"].mean())
+        self.last_mean_reward = float(episodes["reward" if self.team is None else f"return_{self.team}"].mean())
         if self.last_mean_reward > self.best_mean_reward:
             with going_on("the best model"):
                 if self.best_model_save_path is not None:
-                    self.model.save(self.best_model_save_path / "best_model.zip")
+                    learner = self.model if self.team is None else self.model.learners[self.team]
+                    learner.save(self.best_model_save_path / f"best_{self.team or 'model'}.zip")
                 self.best_mean_reward = self.last_mean_reward  # of the model in the file
+
+    def _player(self) -> JointModel:
+        if self.yardstick is None:
+            return self.model
+        player = self.model.learners[str(self.team)].policy
+        return TeamPolicy(self.yardstick.layout, {**self.yardstick.players, str(self.team): player}, self.yardstick.rng)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All evaluations so far, as in ``evaluations.npz``."""
@@ -107,24 +137,30 @@ class MultiAgentEvalCallback(EventCallback):
 
     def get_state(self) -> dict[str, Any]:
         """All results so far, and when the next evaluation is due."""
-        return {**{name: getattr(self, name) for name in self.KEPT}, "evaluations": self._stacked()}
+        drawing = {} if self.yardstick is None else {"yardstick": self.yardstick.get_state()}
+        return {**{name: getattr(self, name) for name in self.KEPT}, "evaluations": self._stacked(), **drawing}
 
     def set_state(self, saved: dict[str, Any]) -> None:
         """Inverse of :meth:`get_state`."""
         for name in self.KEPT:
             setattr(self, name, saved[name])
+        if self.yardstick is not None:
+            self.yardstick.set_state(saved["yardstick"])
         by_name = saved["evaluations"]
         self.evaluations = [{name: values[i] for name, values in by_name.items()} for i in range(len(self.timesteps))]
 
     def _write(self) -> None:
         if self.log_path is not None:
-            with going_on("evaluations.npz"), atomic_write(self.log_path / "evaluations.npz") as file:
+            with going_on("evaluations"), atomic_write(self.log_path / self._file_name()) as file:
                 np.savez(file, **self.arrays())  # type: ignore[arg-type]
+
+    def _file_name(self) -> str:
+        return "evaluations.npz" if self.name == "eval" else f"evaluations_{self.name}.npz"
 
     def _log(self, episodes: dict[str, np.ndarray]) -> None:
         names = {"reward": "mean_reward", "length": "mean_ep_length"}
         for name, values in episodes.items():
-            self.logger.record(f"eval/{names.get(name, name)}", float(values.mean()))
+            self.logger.record(f"{self.name}/{names.get(name, name)}", float(values.mean()))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         with patience(self.logger):
             self.logger.dump(self.num_timesteps)
@@ -133,7 +169,52 @@ class MultiAgentEvalCallback(EventCallback):
             parts = ", ".join(f"{group} {with_interval(values)}" for group, values in returns.items())
             reward = with_interval(episodes["reward"])
             with going_on("the evaluation's result"):
-                print(f"evaluation at {self.num_timesteps:,} env steps: reward {reward} (returns: {parts})")
+                what = "evaluation" if self.name == "eval" else self.name
+                print(f"{what} at {self.num_timesteps:,} env steps: reward {reward} (returns: {parts})")
+
+
+class SavePlayers(BaseCallback):
+    """
+    Saves the actors alone every so many env steps, from the start on, as ``<team>_<N>_steps.zip``: players for matches, for
+    curves of win rates, and for other trainings, many times smaller than checkpoints. A model that learns all agents is the
+    team ``all``.
+
+    :param folder: where they go
+    :param save_freq: env steps between them; the end of the training is one, too
+    """
+
+    model: Any
+
+    def __init__(self, folder: str | Path, save_freq: int) -> None:
+        super().__init__()
+        self.folder, self.save_freq = Path(folder), save_freq
+
+    def _on_training_start(self) -> None:
+        if self.num_timesteps == 0:
+            self._save()
+        self._next = _next_multiple(self.save_freq, self.num_timesteps)
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= self._next:
+            self._next = _next_multiple(self.save_freq, self.num_timesteps)
+            self._save()
+        return True
+
+    def _on_training_end(self) -> None:
+        self._save()
+
+    def _save(self) -> None:
+        for team, learner in self.model.learners.items():
+            with going_on(f"the player of {team}"):
+                ActorPolicy.of(learner.policy).save(self.folder / f"{team}_{self.num_timesteps}_steps.zip")
+
+    def get_state(self) -> dict[str, Any]:
+        """When the next ones are due."""
+        return {"n_calls": self.n_calls, "next": self._next}
+
+    def set_state(self, saved: dict[str, Any]) -> None:
+        """Inverse of :meth:`get_state`."""
+        self.n_calls, self._next = saved["n_calls"], saved["next"]
 
 
 class StopOnSignal(BaseCallback):

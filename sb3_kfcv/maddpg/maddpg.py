@@ -503,6 +503,11 @@ class MADDPG(JointAlgorithm):
         if self._opponent_policy is not None:
             self._line_up = self._opponent_policy.line_up(len(dones), self._line_up, dones)
 
+    @property
+    def learners(self) -> dict[str, MADDPG]:
+        """Itself by the team that it learns, ``all`` if that is everybody; see :class:`CoTraining`, which has several."""
+        return {self.team or "all": self}
+
     def series(self) -> dict[str, Any]:
         return {**self._watch.series(self.actor, self.critic), **self.replay_buffer.diagnostics()}
 

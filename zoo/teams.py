@@ -1,0 +1,134 @@
+"""Which team learns what, and who plays the others: the words of ``--team`` and ``--yardstick``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sb3_kfcv import ALGOS
+from sb3_kfcv.common.layout import AgentLayout
+from sb3_kfcv.common.naming import unknown_name
+from sb3_kfcv.envs.scripted import SCRIPTED_POLICIES
+from sb3_kfcv.saving.files import is_path
+from zoo.hyperparams import merged
+from zoo.run_folder import file_to_play
+
+
+@dataclass
+class Teams:
+    """
+    :param learners: group → algorithm; ``None`` is that of ``--algo``
+    :param players: group → who plays it and does not learn: the name of a scripted policy, a path, or a list of these
+    """
+
+    learners: dict[str, str | None]
+    players: dict[str, Any]
+
+
+def parse_teams(words: Sequence[str] | str | None) -> Teams:
+    """
+    The words of ``--team``: ``wolf`` or ``wolf=kfcv_maddpg`` learns; ``sheep=graze``, ``sheep=logs/…/model.zip`` or a mixture
+    ``sheep=graze,flee`` plays.
+
+    :param words: as they were typed
+    :raises ValueError: for a word that is neither, and for two of one group
+    """
+    teams = Teams({}, {})
+    for word in [words] if isinstance(words, str) else words or ():
+        group, equals, player = word.partition("=")
+        if not group or (equals and not player):
+            raise ValueError(f'--team takes GROUP=ALGORITHM or GROUP=PLAYER, such as sheep=graze; got "{word}"')
+        if group in teams.learners or group in teams.players:
+            raise ValueError(f"--team says twice who plays {group}")
+        if not equals or player in ALGOS:
+            teams.learners[group] = player or None
+        else:
+            teams.players[group] = parse_player(player)
+    if teams.players and not teams.learners:
+        raise ValueError(f"no team learns: give one an algorithm, such as --team GROUP={next(iter(ALGOS))}")
+    return teams
+
+
+def parse_player(text: str) -> Any:
+    """
+    A player's name, or the file of a path (of a run folder its last model, else its latest checkpoint); a list of several,
+    which stand between commas, is a mixture.
+
+    :raises ValueError: if there is no such file
+    """
+    players = [str(file_to_play(part).resolve()) if is_path(part) else part for part in text.split(",")]
+    return players[0] if len(players) == 1 else players
+
+
+class Yardstick(NamedTuple):
+    """A fixed opponent that a learning team is measured by."""
+
+    team: str
+    name: str
+    opponents: dict[str, Any]
+
+
+def yardsticks(words: Sequence[str], layout: AgentLayout, learners: Sequence[str], default: bool) -> list[Yardstick]:
+    """
+    What every learning team is measured by: each player of ``--yardstick``; where the other groups are several, the further
+    ones are played by their first.
+
+    :param words: of ``--yardstick``, such as ``sheep=graze``
+    :param layout: who sits where
+    :param learners: the groups that learn
+    :param default: without words, take every scripted policy of the world
+    :raises ValueError: for a word that is none, or an unknown group
+    """
+    given: dict[str, list[str]] = {}
+    for word in words:
+        group, equals, player = word.partition("=")
+        if not equals or not player:
+            raise ValueError(f'--yardstick takes GROUP=PLAYER, such as sheep=graze; got "{word}"')
+        if group not in layout.group_names:
+            raise ValueError(unknown_name("group", group, layout.group_names))
+        given.setdefault(group, []).append(player)
+    if not given and not default:
+        return []
+    players = {group: given.get(group) or scripted_names(group) for group in layout.group_names}
+    found = []
+    for team in learners:
+        others = [group for group in layout.group_names if group != team]
+        first = {group: parse_player(players[group][0]) for group in others}
+        for group in others:
+            for player in players[group] if not given or group in given else ():
+                name = f"{team}_vs_{label(player)}"
+                found.append(Yardstick(team, name, {**first, group: parse_player(player)}))
+    return found
+
+
+def scripted_names(group: str) -> list[str]:
+    """The scripted policies that play a group with some sense, or the random one if there is none such."""
+    named = [name for name in SCRIPTED_POLICIES.get(group, {}) if name not in ("random", "still", "oracle")]
+    return named or ["random"]
+
+
+def label(player: str) -> str:
+    """A player's name as part of a file's name and of a log's key."""
+    return Path(player).stem.replace(" ", "-") if is_path(player) else player.replace(",", "+")
+
+
+def with_teams(settings: Mapping[str, Any], pairs: Mapping[str, Any], own: Sequence[str]) -> dict[str, Any]:
+    """
+    Settings of co-training changed by the command line: ``wolf.gamma:0.9`` of one team, ``gamma:0.9`` of all.
+
+    :param settings: with a map of ``teams``
+    :param pairs: name → value
+    :param own: names of settings that are not a team's
+    """
+    teams: dict[str, Any] = dict(settings["teams"])
+    changed = dict(settings)
+    for name, value in pairs.items():
+        if name in teams:
+            teams[name] = merged(teams[name], value)
+        elif name in own:
+            changed = merged(changed, {name: value})
+        else:
+            teams = {team: merged(theirs, {name: value}) for team, theirs in teams.items()}
+    return {**changed, "teams": teams}
