@@ -262,7 +262,9 @@ class CoTraining(JointAlgorithm):
 
     def _note_results(self, ended: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """Tell the pools who won against teams that played as they are now."""
-        for team, metric in self._wins.items() if self._line_up is not None and len(self.teams) == 2 else ():
+        if self.pool_share == 0 or self._line_up is None or len(self.teams) != 2:
+            return
+        for team, metric in self._wins.items():
             if team not in self.teams or not all(metric in info for info in infos):
                 continue
             won = np.array([info[metric] for info in infos])
