@@ -44,6 +44,7 @@ setup(
             "supersuit>=3.9",
             "mpe2>=1.0",
         ],
+        "contrib": ["sb3-contrib>=2.9"],
         "video": ["moviepy>=2.0"],
         "docs": ["mkdocs>=1.6", "mkdocstrings[python]>=0.26"],
     },

@@ -5,6 +5,7 @@ import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch as th
 
@@ -101,3 +102,33 @@ def test_peers_in_one_table(script):
     assert "no figure" in table
     best = compare.best_batches(compare.pairs_of({"pairs": pairs}))
     assert [line.split("|")[-2].strip() for line in best[2:]] == ["**8.0×**", "**8.0×**"]  # ours at its best: 1 ms
+
+
+def test_stock_algorithms_go_on_from_their_file_and_say_what_was_measured(script, tmp_path, monkeypatch, capsys):
+    """All trainings but one are in the file; of by rank and uniform, 2 and 4 against 1 and 2, one pair of four is equal."""
+    stock, output, image = script("stock_algorithms"), tmp_path / "stock.json", tmp_path / "stock.png"
+    reached = {"uniform": [1.0, 2.0], "by rank": [2.0, 4.0], "curriculum": [1.0, 1.0]}
+    runs = [
+        {"env": env, "replay": replay, "seed": seed, "steps": task.steps // 100, "returns": [value] * 20, "seconds": 2.0}
+        for env, task in stock.TASKS.items()
+        for replay, values in reached.items()
+        for seed, value in enumerate(values)
+    ]
+    left_out = runs.pop(5)
+    output.write_text(json.dumps(runs))
+    monkeypatch.setattr(stock, "EPISODES", 1)
+    arguments = ["--seeds", "2", "--share", "0.01", "--output", str(output), "--image", str(image)]
+    monkeypatch.setattr(sys, "argv", ["stock_algorithms.py", *arguments])
+    stock.main()
+    assert "| DQN on CartPole-v1 | by rank | 3 [2, 4] | 3 [2, 4] | 0.88 | 1.00 | 2 |" in capsys.readouterr().out
+    assert image.stat().st_size > 10_000
+    *others, trained = json.loads(output.read_text())
+    assert others == runs
+    assert {name: trained[name] for name in ("env", "replay", "seed", "steps")}.items() <= left_out.items()
+    assert len(trained["returns"]) == 20
+
+
+def test_mean_between_the_quartiles_leaves_out_the_outer_seeds(script):
+    mean, low, high = script("stock_algorithms").interval(np.array([0.0, 1.0, 2.0, 99.0]))
+    assert mean == 1.5
+    assert low < 1.5 < high

@@ -204,7 +204,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
 
         :param batch_size: number of rows
         """
-        rows = self.rng.integers(self.n_rows, size=batch_size)
+        rows = self._uniform_rows(batch_size)
         if self.stage > self.n_folds or self.n_refreshes == 0:
             return rows
         members = self._bucket_members()

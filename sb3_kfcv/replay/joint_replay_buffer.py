@@ -228,7 +228,10 @@ class JointReplayBuffer(ReplayBuffer):
                 self.states[pos] = [info["state"] for info in infos]
                 following["next_states"] = [info["next_state"] for info in infos]
         except KeyError as missing:
-            raise ValueError(f"the env's infos lack {missing}; wrap a PettingZoo parallel env in JointEnv") from None
+            raise ValueError(
+                f"the env's infos lack {missing}; wrap a PettingZoo parallel env in JointEnv "
+                "(for one agent and the algorithms of SB3 there are the replay buffers of sb3_kfcv.stock)"
+            ) from None
         self.observations[pos] = obs
         previous = (pos - 1) % self.buffer_size if self.n_added and self.buffer_size > 1 else None
         self._successors.add(pos, previous, following)
@@ -252,7 +255,11 @@ class JointReplayBuffer(ReplayBuffer):
 
     def _draw(self, batch_size: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Which rows to draw, and their importance weights (``None``: all one)."""
-        return self.rng.integers(self.n_rows, size=batch_size), None
+        return self._uniform_rows(batch_size), None
+
+    def _uniform_rows(self, batch_size: int) -> np.ndarray:
+        """Draw rows, all alike."""
+        return self.rng.integers(self.n_rows, size=batch_size)
 
     def rows(self, rows: np.ndarray, weights: np.ndarray | None = None) -> JointReplayBufferSamples:
         """
