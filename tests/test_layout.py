@@ -72,3 +72,12 @@ def test_an_image_observation_is_refused_by_the_agents_name():
 def test_mixed_action_kinds_are_refused():
     with pytest.raises(ValueError, match="one kind for all"):
         AgentLayout.from_spaces(["a_0", "b_0"], {"a_0": box(2), "b_0": box(2)}, {"a_0": box(1), "b_0": spaces.Discrete(2)})
+
+
+def test_group_means_do_not_depend_on_the_number_of_rows():
+    agents = tuple(f"{group}_{i}" for group in ("wolf", "sheep") for i in range(16))
+    layout = AgentLayout(agents, tuple(agent.partition("_")[0] for agent in agents), (1,) * 32, (1,) * 32)
+    values = np.random.default_rng(0).normal(size=(64, 32))
+    together = layout.group_means(values)
+    for i, row in enumerate(values):
+        assert {group: mean[i] for group, mean in together.items()} == layout.group_means(row)

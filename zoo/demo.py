@@ -18,12 +18,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import e
 from sb3_kfcv.common.callbacks import TrainByTheClock
 from sb3_kfcv.common.evaluation import evaluate, with_interval
 from sb3_kfcv.common.layout import AgentLayout
-from sb3_kfcv.saving.files import atomic_write
 from sb3_kfcv.teams.players import JointModel
 from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env import make_vec_env
 from sb3_kfcv.vec_env.make import layout_of
-from zoo.plots import ALGO_COLOURS, ALGO_LABELS, draw_curve, draw_references, new_figure, save_figure
+from zoo.plots import ALGO_COLOURS, ALGO_LABELS, draw_curve, draw_references, new_figure, save_arrays, save_figure
 from zoo.recording import record, save_gif
 from zoo.run_folder import RunFolder
 from zoo.train import build, make_parser, start_logs, train
@@ -190,12 +189,6 @@ def verdict(results: Mapping[tuple[str, str], Mapping[str, np.ndarray]]) -> str:
             )
         sentences.append(f"Against {rival!r} a trained {group} gets " + "; ".join(comparisons) + ".")
     return "\n".join(sentences)
-
-
-def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Keep the data behind a picture beside it."""
-    with atomic_write(path) as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from sb3_kfcv.common.evaluation import with_interval
+from sb3_kfcv.common.evaluation import Interval, with_interval
 from sb3_kfcv.saving.files import atomic_write
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers.
@@ -18,18 +21,20 @@ ALGO_COLOURS = {"maddpg": "#0072B2", "per_maddpg": "#E69F00", "kfcv_maddpg": "#0
 ALGO_LABELS = {"maddpg": "MADDPG", "per_maddpg": "PER-MADDPG", "kfcv_maddpg": "KFCV-MADDPG"}
 REFERENCE_COLOUR = "#666666"
 REFERENCE_DASHES = ("--", ":", "-.")
+HEAT_MAP = "cividis"  # reads the same with every kind of colour vision
 
 DPI = 150
 
 
-def new_figure(n_panels: int, title: str | None = None) -> tuple[Figure, list[Axes]]:
+def new_figure(n_panels: int, title: str | None = None, size: tuple[float, float] = (5.2, 3.8)) -> tuple[Figure, list[Axes]]:
     """
     A figure with panels side by side.
 
     :param n_panels: how many
     :param title: over all of them
+    :param size: width and height of each, in inches
     """
-    figure = Figure(figsize=(5.2 * n_panels, 3.8), layout="constrained")
+    figure = Figure(figsize=(size[0] * n_panels, size[1]), layout="constrained")
     FigureCanvasAgg(figure)
     axes = list(figure.subplots(1, n_panels, squeeze=False)[0])
     for axis in axes:
@@ -51,9 +56,58 @@ def draw_curve(axis: Axes, steps: np.ndarray, episodes: np.ndarray, colour: str,
     :param colour: of the line
     :param label: for the legend
     """
-    means, low, high = np.array([with_interval(values) for values in episodes]).T
-    axis.plot(steps, means, color=colour, label=label, marker="o", markersize=3)
+    draw_intervals(axis, steps, [with_interval(values) for values in episodes], colour, label)
+
+
+def draw_intervals(
+    axis: Axes, steps: Sequence[int] | np.ndarray, intervals: Sequence[Interval], colour: str, label: str, dashes: str = "-"
+) -> None:
+    """
+    Means over time, with a band of their intervals.
+
+    :param axis: where to draw
+    :param steps: env steps (evaluations,)
+    :param intervals: of each evaluation
+    :param colour: of the line
+    :param label: for the legend
+    :param dashes: style of the line
+    """
+    means, low, high = np.array(intervals).T
+    axis.plot(steps, means, color=colour, label=label, marker="o", markersize=3, linestyle=dashes)
     axis.fill_between(steps, low, high, color=colour, alpha=0.25, linewidth=0)
+
+
+def draw_heat_map(
+    axis: Axes,
+    intervals: Sequence[Sequence[Interval]],
+    rows: Sequence[str],
+    columns: Sequence[str],
+    limits: tuple[float, float],
+    label: str,
+) -> None:
+    """
+    A table as colours, with each number and its interval written into its cell.
+
+    :param axis: where to draw
+    :param intervals: of each cell (rows, columns)
+    :param rows: labels, from above
+    :param columns: labels
+    :param limits: values of the darkest and of the brightest colour
+    :param label: what the colours mean
+    """
+    colours, scale = colormaps[HEAT_MAP], Normalize(*limits)
+    image = axis.imshow([[cell.mean for cell in line] for line in intervals], cmap=colours, norm=scale, aspect="auto")
+    for i, line in enumerate(intervals):
+        for k, cell in enumerate(line):
+            ink = "black" if scale(cell.mean) > 0.5 else "white"
+            axis.text(k, i, f"{cell.mean:.2f}", ha="center", va="bottom", color=ink, fontsize=10)
+            axis.text(k, i + 0.06, f"{cell.low:.2f} … {cell.high:.2f}", ha="center", va="top", color=ink, fontsize=7)
+    axis.set_xticks(range(len(columns)), columns, rotation=30, ha="right", rotation_mode="anchor")
+    axis.set_yticks(range(len(rows)), rows)
+    axis.grid(False)
+    axis.tick_params(length=0)
+    axis.spines[:].set_visible(False)
+    axis.figure.colorbar(image, ax=axis, label=label)
 
 
 def draw_references(axis: Axes, values: dict[str, float]) -> None:
@@ -76,3 +130,9 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     """
     with atomic_write(path) as file:
         figure.savefig(file, format="png", dpi=DPI)
+
+
+def save_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Keep the data behind a picture beside it."""
+    with atomic_write(path) as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -116,6 +117,12 @@ class RunFolder:
     def players(self) -> Path:
         return self.path / "players"
 
+    def snapshots(self, group: str) -> dict[int, Path]:
+        """The files that can play a group, by number of env steps, the earliest first: saved players, and the checkpoints."""
+        name = re.compile(rf"({re.escape(group)}|all)_(\d+)_steps\.zip")
+        saved = {int(match.group(2)): path for path in self.players.glob("*") if (match := name.fullmatch(path.name))}
+        return dict(sorted({**checkpoints_in(self.path), **saved}.items()))
+
     @property
     def replay_buffer(self) -> Path:
         return self.path / "replay_buffer.zip"
@@ -156,10 +163,12 @@ class RunFolder:
         return [f"{name} {then.get(name)} → {found}" for name, found in now.items() if then.get(name) != found]
 
 
-def file_to_play(path: str | Path) -> Path:
+def file_to_play(path: str | Path, best_of: str | None = None) -> Path:
     """
     The file that a path means as a player: the file itself; of a run folder the last model, else the latest checkpoint.
 
+    :param path: of a file or a run folder
+    :param best_of: of a run folder the model of the best evaluation instead, of this group where it was measured by itself
     :raises ValueError: if there is none
     """
     file: Path = existing(Path(path))
@@ -168,6 +177,11 @@ def file_to_play(path: str | Path) -> Path:
     if not Path(path).is_dir():
         raise ValueError(f"there is no file {path} to take a player of")
     folder = RunFolder.existing(path)
+    if best_of is not None:
+        for best in (folder.path / f"best_{best_of}.zip", folder.path / "best_model.zip"):
+            if best.is_file():
+                return best
+        raise ValueError(f"the run in {folder.path} has no best_{best_of}.zip and no best_model.zip yet")
     if folder.last_model.is_file():
         return folder.last_model
     checkpoints = [*checkpoints_in(folder.path).values()]

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 from sb3_kfcv import ALGOS
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.naming import unknown_name
-from sb3_kfcv.envs.scripted import SCRIPTED_POLICIES
 from sb3_kfcv.saving.files import is_path
+from sb3_kfcv.teams.players import scripted_for
 from zoo.hyperparams import merged
 from zoo.run_folder import file_to_play
 
@@ -91,7 +91,7 @@ def yardsticks(words: Sequence[str], layout: AgentLayout, learners: Sequence[str
         given.setdefault(group, []).append(player)
     if not given and not default:
         return []
-    players = {group: given.get(group) or scripted_names(group) for group in layout.group_names}
+    players = {group: given.get(group) or with_some_sense(scripted_for(layout, group)) for group in layout.group_names}
     found = []
     for team in learners:
         others = [group for group in layout.group_names if group != team]
@@ -103,10 +103,9 @@ def yardsticks(words: Sequence[str], layout: AgentLayout, learners: Sequence[str
     return found
 
 
-def scripted_names(group: str) -> list[str]:
-    """The scripted policies that play a group with some sense, or the random one if there is none such."""
-    named = [name for name in SCRIPTED_POLICIES.get(group, {}) if name not in ("random", "still", "oracle")]
-    return named or ["random"]
+def with_some_sense(names: Sequence[str]) -> list[str]:
+    """Those scripted policies that a team can be measured by, or the random one if there is none such."""
+    return [name for name in names if name not in ("random", "still", "oracle")] or ["random"]
 
 
 def label(player: str) -> str:

@@ -151,7 +151,7 @@ class MultiAgentEvalCallback(EventCallback):
 
     def _write(self) -> None:
         if self.log_path is not None:
-            with going_on("evaluations"), atomic_write(self.log_path / self._file_name()) as file:
+            with going_on(self._file_name()), atomic_write(self.log_path / self._file_name()) as file:
                 np.savez(file, **self.arrays())  # type: ignore[arg-type]
 
     def _file_name(self) -> str:
@@ -190,6 +190,8 @@ class SavePlayers(BaseCallback):
         self.folder, self.save_freq = Path(folder), save_freq
 
     def _on_training_start(self) -> None:
+        if self.model.get_vec_normalize_env() is not None:
+            raise ValueError("players are saved without the statistics of VecNormalize, and would not play as they learnt")
         if self.num_timesteps == 0:
             self._save()
         self._next = _next_multiple(self.save_freq, self.num_timesteps)

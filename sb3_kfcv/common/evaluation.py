@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import ndtri, stdtrit
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_kfcv.teams.players import JointModel
@@ -74,3 +74,18 @@ def with_interval(values: np.ndarray) -> Interval:
         return Interval(mean, np.nan, np.nan)
     half_width = float(stdtrit(len(values) - 1, (1 + CONFIDENCE) / 2) * values.std(ddof=1) / np.sqrt(len(values)))
     return Interval(mean, mean - half_width, mean + half_width)
+
+
+def share_with_interval(values: np.ndarray) -> Interval:
+    """
+    Mean over episodes of a share, such as of the episodes won, and its 95 % confidence interval by Wilson's score, which stays
+    within [0, 1] and says something for 0 and 1, too.
+
+    :param values: in [0, 1] (episodes,)
+    """
+    values = np.asarray(values, dtype=float)
+    n, share = len(values), float(values.mean())
+    z = float(ndtri((1 + CONFIDENCE) / 2))
+    centre = (share + z**2 / (2 * n)) / (1 + z**2 / n)
+    half_width = z / (1 + z**2 / n) * float(np.sqrt(share * (1 - share) / n + z**2 / (4 * n**2)))
+    return Interval(share, max(centre - half_width, 0.0), min(centre + half_width, 1.0))

@@ -122,8 +122,11 @@ class AgentLayout:
         return tuple(i for i, name in enumerate(self.groups) if name == group)
 
     def group_means(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        """Mean over the agents of each group; ``values`` is (…, agents)."""
-        return {group: values[..., list(self.members(group))].mean(axis=-1) for group in self.group_names}
+        """
+        Mean over the agents of each group; ``values`` is (…, agents). ``take`` lays a row's values side by side, so that they
+        are summed up in one order, however many rows there are.
+        """
+        return {group: np.take(values, self.members(group), axis=-1).mean(axis=-1) for group in self.group_names}
 
     def to_dict(self) -> dict[str, Any]:
         """The layout as plain JSON values."""

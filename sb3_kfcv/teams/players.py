@@ -161,6 +161,16 @@ def _described(layout: AgentLayout) -> str:
     return f"{layout}, and a state of {layout.state_size}"
 
 
+def scripted_for(layout: AgentLayout, group: str) -> tuple[str, ...]:
+    """
+    The names of the scripted policies that can play a group.
+
+    :raises ValueError: for an unknown group
+    """
+    layout.members(group)
+    return tuple(SCRIPTED_POLICIES[group]) if group in SCRIPTED_POLICIES and not _is_foreign(layout, group) else ("random",)
+
+
 def _scripted(
     name: str,
     layout: AgentLayout,
@@ -185,9 +195,10 @@ def _scripted(
 
 
 def _is_foreign(layout: AgentLayout, group: str) -> bool:
-    """Whether a group of a familiar name is of another world: its forces are not two numbers, or five choices."""
+    """Whether a group of a familiar name is of another world: in other company, or not by two numbers or five choices."""
+    at_home = {"agent"} if group == "agent" else {"wolf", "sheep"}
     sizes = {layout.action_sizes[i] for i in layout.members(group)}
-    return sizes != ({5} if layout.discrete else {2})
+    return not set(layout.group_names) <= at_home or sizes != ({5} if layout.discrete else {2})
 
 
 def load_player(path: str | os.PathLike[str], group: str | None = None) -> ActorPolicy:
