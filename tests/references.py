@@ -47,15 +47,16 @@ def parameters_of(model):
     return {name: value.clone() for name, value in model.policy.state_dict().items()}
 
 
-def random_infos(rng, layout, n_envs, death_rate=0.0, alive_rate=1.0):
+def random_infos(rng, layout, n_envs, death_rate=0.0, alive_rate=1.0, join_rate=0.0):
     """Infos as an env gives them, of made-up steps."""
     infos = []
     for _ in range(n_envs):
         alive = rng.random(layout.n_agents) < alive_rate
+        absent = ~alive & (rng.random(layout.n_agents) >= join_rate) if join_rate else ~alive
         infos.append(
             {
                 "agent_rewards": (rng.normal(size=layout.n_agents) * alive).astype(np.float32),
-                "agent_terminated": ~alive | (rng.random(layout.n_agents) < death_rate),
+                "agent_terminated": absent | (alive & (rng.random(layout.n_agents) < death_rate)),
                 "agent_alive": alive,
                 "state": rng.normal(size=layout.state_size).astype(np.float32),
                 "next_state": rng.normal(size=layout.state_size).astype(np.float32),

@@ -186,7 +186,7 @@ class Pictures(ToyParallelEnv):
 
 
 def test_a_world_of_pictures():
-    with refused("scout_0.*flat Box"):
+    with refused("scout_0.*a picture.*features"):
         MADDPG("MlpPolicy", Pictures())
 
 

@@ -9,7 +9,7 @@ from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
 from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 from toy_envs import ToyParallelEnv
 
 from sb3_kfcv import MADDPG, JointEnv, ParticleVecEnv, make_vec_env
@@ -144,6 +144,131 @@ def test_a_world_without_state_gives_none():
     _, results = play(env, 1)
     assert env.layout.state_size == 0
     assert "state" not in results[0][3]
+
+
+# ---- agents that come late, and that are cut off alone
+
+
+def test_who_joins_late_is_absent_until_then():
+    _, results = play(joint(joins={"tank_0": 2}), 3)
+    assert [info["agent_alive"].tolist() for *_, info in results] == [[True, True, False]] * 2 + [[True] * 3]
+    assert [info["agent_terminated"].tolist() for *_, info in results] == [[False, False, True]] + [[False] * 3] * 2
+    assert [info["agent_rewards"][2] for *_, info in results] == [0, 0, 9]
+
+
+def test_who_joins_late_is_seen_from_then_on():
+    observations, _ = play(joint(joins={"tank_0": 2}), 3)
+    assert [bool(row[6:].any()) for row in observations] == [False, False, True, True]
+
+
+def test_who_is_cut_off_alone_is_no_death_in_its_step_and_absent_later():
+    observations, results = play(joint(cuts={"scout_1": 2}), 3)
+    assert [info["agent_terminated"].tolist()[1] for *_, info in results] == [False, False, True]
+    assert [info["agent_alive"].tolist()[1] for *_, info in results] == [True, True, False]
+    assert observations[2][4] == 2  # its last observation, from which its return goes on
+    assert not observations[3][3:6].any()
+
+
+def test_a_world_in_which_the_last_agents_are_cut_off_one_by_one_is_truncated():
+    _, results = play(joint(cuts={"scout_0": 1, "scout_1": 2, "tank_0": 3}), 3)
+    assert [(terminated, truncated) for _, terminated, truncated, _ in results] == [(False, False)] * 2 + [(False, True)]
+
+
+def test_a_world_whose_last_agents_die_after_one_was_cut_off_has_ended():
+    _, results = play(joint(cuts={"scout_0": 1}, deaths={"scout_1": 2, "tank_0": 2}), 2)
+    assert results[-1][1:3] == (True, False)
+
+
+class Lingering(ToyParallelEnv):
+    """Leaves it to the next reset to empty the list of agents, as many worlds do."""
+
+    def step(self, actions):
+        result = super().step(actions)
+        self.agents = list(self.possible_agents)
+        return result
+
+
+def test_an_episode_is_over_when_all_agents_are_flagged():
+    _, results = play(JointEnv(Lingering(time_limit=2)), 2)
+    assert [truncated for _, _, truncated, _ in results] == [False, True]
+    assert "episode_metrics" in results[1][3]
+
+
+def test_joiners_and_cuts_are_trained_on():
+    env = joint(joins={"tank_0": 2}, cuts={"scout_1": 3}, time_limit=5)
+    model = MADDPG("MlpPolicy", env, seed=0, **QUICK).learn(40)
+    assert model.replay_buffer.alive[:5, 0].tolist() == [[1, 1, 0], [1, 1, 0], [1, 1, 1], [1, 0, 1], [1, 0, 1]]
+    assert model.replay_buffer.dones[:5, 0].tolist() == [[0, 0, 1], [0, 0, 0], [0, 0, 0], [0, 1, 0], [0, 1, 0]]
+
+
+# ---- worlds that break the rules
+
+
+def test_a_stranger_is_named():
+    env = joint()
+    env.reset(seed=0)
+    env.parallel_env.agents.append("ghost_0")
+    env.parallel_env._observations = lambda agents: {}
+    with pytest.raises(
+        ValueError, match=r"'ghost_0' joined the world, which has the possible_agents scout_0, scout_1, tank_0"
+    ):
+        env._find_present({}, {})
+
+
+def test_a_world_that_does_not_say_who_may_take_part_is_refused():
+    with pytest.raises(ValueError, match="lists no possible_agents"):
+        JointEnv(ToyParallelEnv(agents=()))
+
+
+def grown(env, agent):
+    """Let an agent observe one number more."""
+    env.parallel_env._observation_spaces[agent] = gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
+
+
+def test_spaces_that_change_between_episodes_are_named():
+    env = joint()
+    env.reset(seed=0)
+    grown(env, "scout_1")
+    with pytest.raises(ValueError, match=r"observation space of 'scout_1' was Box\(.*\(3,\).* and has become Box\(.*\(4,\)"):
+        env.reset()
+
+
+def test_spaces_of_a_joiner_that_have_changed_are_named():
+    env = joint(joins={"tank_0": 1})
+    env.reset(seed=0)
+    env.parallel_env._action_spaces["tank_0"] = gym.spaces.Box(-1, 1, (3,), np.float32)
+    with pytest.raises(ValueError, match=r"action space of 'tank_0' was .* and has become"):
+        env.step(zeros(env))
+
+
+def test_observations_that_change_within_an_episode_are_named():
+    env = joint()
+    env.reset(seed=0)
+    grown(env, "scout_1")
+    env.parallel_env._observations = lambda agents: {agent: np.zeros(4, np.float32) for agent in ["scout_1"]}
+    with pytest.raises(ValueError, match=r"observation of 'scout_1' is an array of shape \(4,\).*\(3,\).*become.*\(4,\)"):
+        env.step(zeros(env))
+
+
+def test_a_single_number_does_not_pass_for_a_vector():
+    env = joint()
+    env.reset(seed=0)
+    env.parallel_env._observations = lambda agents: {"scout_1": np.zeros(1, np.float32)}
+    with pytest.raises(ValueError, match=r"observation of 'scout_1' is an array of shape \(1,\)"):
+        env.step(zeros(env))
+
+
+def test_a_state_of_another_length_is_refused():
+    env = joint()
+    env.parallel_env.state = lambda: np.zeros(3, np.float32)
+    with pytest.raises(ValueError, match="state has 3 numbers; its state_space says 4"):
+        env.reset(seed=0)
+
+
+def test_a_wrapper_that_hides_the_end_is_found_out():
+    env = JointEnv(pytest.importorskip("supersuit").black_death_v3(ToyParallelEnv(time_limit=2)))
+    with pytest.raises(ValueError, match=r"goes on although its world has ended.*black_death"):
+        play(env, 2)
 
 
 # ---- the end of an episode
@@ -349,6 +474,22 @@ def test_observations_can_be_normalised():
     np.testing.assert_allclose(
         model.replay_buffer.rows(np.arange(5)).observations.numpy(), env.normalize_obs(raw.reshape(-1, raw.shape[-1])[:5])
     )
+
+
+def test_stacked_frames_of_whole_worlds_are_refused():
+    """They would stand side by side over all agents: nobody could tell whose they are."""
+    env = VecFrameStack(DummyVecEnv([joint]), n_stack=2)
+    with pytest.raises(ValueError, match=r"observe 8 numbers.*\(16,\).*VecFrameStack.*wrappers=\[supersuit.frame_stack_v2\]"):
+        MADDPG("MlpPolicy", env, **QUICK)
+
+
+def test_gymnasium_makes_a_vec_env_of_our_worlds():
+    envs = gym.make_vec("HardSpread-v0", num_envs=2, vectorization_mode="sync", **SMALL_SPREAD)
+    envs.reset(seed=0)
+    for _ in range(SMALL_SPREAD["max_steps"]):
+        _, _, _, truncated, infos = envs.step(envs.action_space.sample())
+    assert truncated.tolist() == [True, True]
+    assert infos["agent_rewards"].shape == (2, 2)
 
 
 def test_normalised_rewards_are_refused():

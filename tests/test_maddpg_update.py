@@ -25,7 +25,7 @@ def make_model(toy=None, **kwargs):
         "MlpPolicy", JointEnv(ToyParallelEnv(**(toy or {}))), buffer_size=64, batch_size=BATCH, seed=1, device="cpu", **kwargs
     )
     model.set_logger(configure(None, []))
-    fill(model.replay_buffer, model.layout, 64, death_rate=0.1, alive_rate=0.8)
+    fill(model.replay_buffer, model.layout, 64, death_rate=0.1, alive_rate=0.8, join_rate=0.3)
     return model
 
 
@@ -116,7 +116,7 @@ class SlowMADDPG:
                 next_actions = th.cat(
                     [self.best_action("actor_target", i, batch.next_observations) for i in range(layout.n_agents)], dim=1
                 )
-                next_actions = self.without_the_dead(next_actions, batch.alive * (1 - batch.dones))
+                next_actions = self.without_the_dead(next_actions, 1 - batch.dones)
                 next_input = th.cat([next_seen, next_actions], dim=1)
                 next_q = th.cat([net(next_input) for net in self.nets["critic_target"][v]], dim=1).min(dim=1).values
                 y = model.reward_scale * batch.rewards[:, v] + model.gamma * (1 - gone) * next_q

@@ -9,6 +9,7 @@ from pettingzoo.test import api_test, parallel_api_test, seed_test
 from pettingzoo.test.seed_test import parallel_seed_test
 from pettingzoo.test.state_test import state_test
 from pettingzoo.utils.conversions import parallel_to_aec
+from stable_baselines3 import PPO
 
 from sb3_kfcv.envs import grassland_v0, hard_spread_v0, register
 
@@ -151,6 +152,27 @@ def test_human_mode_runs_without_a_display():
 def test_an_unknown_render_mode_is_refused():
     with pytest.raises(ValueError, match="unknown render_mode 'rgb'"):
         grassland_v0.parallel_env(render_mode="rgb")
+
+
+def test_a_step_of_nobody_after_the_end_does_nothing():
+    env = hard_spread_v0.parallel_env(max_steps=1)
+    env.reset(seed=0)
+    env.step({agent: np.zeros(2) for agent in env.agents})
+    state = env.state()
+    assert env.step({}) == ({}, {}, {}, {}, {})
+    np.testing.assert_array_equal(env.state(), state)
+
+
+@pytest.mark.parametrize("module", MODULES, ids=name)
+def test_stock_ppo_trains_with_one_slot_per_agent(module):
+    """SuperSuit's way to SB3, which keeps the dead in their slots and knows no seeds."""
+    supersuit = pytest.importorskip("supersuit")
+    env = supersuit.black_death_v3(module.parallel_env(max_steps=10))
+    n_agents = len(env.possible_agents)
+    slots = supersuit.concat_vec_envs_v1(supersuit.pettingzoo_env_to_vec_env_v1(env), 2, base_class="stable_baselines3")
+    assert slots.num_envs == 2 * n_agents
+    model = PPO("MlpPolicy", slots, n_steps=16, batch_size=64, n_epochs=1, device="cpu")
+    assert model.learn(2 * n_agents * 16).num_timesteps == 2 * n_agents * 16
 
 
 @pytest.mark.skipif(not hasattr(pettingzoo, "register"), reason="this PettingZoo has no registry")

@@ -22,6 +22,7 @@ from sb3_kfcv.saving.checkpoints import checkpoints_in
 from sb3_kfcv.saving.normalization import load_normalization
 from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import WORLDS, layout_of
+from sb3_kfcv.vec_env.subproc import TracedSubprocVecEnv
 from zoo import demo, train
 from zoo.hyperparams import check, load_entry, merged, parse_pairs
 from zoo.run_folder import RunFolder
@@ -231,6 +232,12 @@ BAD_INPUT = [
     ("--eval-env-kwargs n_wolves:3", "make a world whose agents are not those of the training"),
     ("--team wolf --opponents sheep:fle", 'did you mean "flee"?'),
     ("--eval-episodes 0", "--eval-episodes is 0; it must be at least 1"),
+    ("--env mpe2/simple_tg_v3", 'unknown environment "mpe2/simple_tg_v3"; did you mean "mpe2/simple_tag_v3"?'),
+    ("--env classic/rps_v2", "has no entry for classic/rps_v2; it has Grassland-v0, HardSpread-v0"),
+    ("--vec-env many", "argument --vec-env: invalid choice: 'many'"),
+    ("-params env_wrapper:os.system", 'env_wrapper "os.system" is no wrapper of SuperSuit'),
+    ("-params env_wrapper:supersuit.frame_stak_v2", 'did you mean "supersuit.frame_stack_v2"?'),
+    ("-params env_wrapper:3", "hyperparameter env_wrapper is 3; it must be text or a map or a list or null"),
 ]
 
 
@@ -391,3 +398,79 @@ def test_a_log_folder_that_is_a_file_is_refused_in_a_sentence(tmp_path, capsys):
     words = command(tmp_path, "HardSpread-v0", "maddpg")
     assert train.main([*words, "-f", str(tmp_path / "file")]) == 2
     assert capsys.readouterr().err.startswith("error: the run cannot write its files")
+
+
+MPE_YAML = """
+mpe2/simple_tag_v3:
+  n_timesteps: 120
+  n_envs: 2
+  learning_starts: 20
+  batch_size: 8
+  buffer_size: 200
+  normalize: true
+  env_kwargs: {max_cycles: 5, continuous_actions: true}
+  env_wrapper:
+    - supersuit.frame_stack_v2: {stack_size: 3}
+    - supersuit.pad_observations_v0
+"""
+
+
+def mpe_command(folder, *more):
+    pytest.importorskip("mpe2")
+    pytest.importorskip("supersuit")
+    (folder / "mpe.yml").write_text(MPE_YAML)
+    words = ["--algo", "maddpg", "--env", "mpe2/simple_tag_v3", "-conf", str(folder / "mpe.yml"), "-f", str(folder / "logs")]
+    return [*words, "--seed", "1", "--eval-freq", "60", "--eval-episodes", "3", "--verbose", "0", *more]
+
+
+def test_a_world_of_pettingzoo_trains_with_its_wrappers(tmp_path):
+    """Training and evaluation alike: three frames of 16 numbers for each of the four, the agent's 14 padded."""
+    assert train.main(mpe_command(tmp_path)) == 0
+    run = RunFolder(tmp_path / "logs" / "maddpg" / "mpe2-simple_tag_v3_1", "mpe2/simple_tag_v3")
+    model = ALGOS["maddpg"].load(run.last_model)
+    assert (model.num_timesteps, model.layout.obs_sizes) == (120, (48,) * 4)
+    with np.load(run.path / "evaluations.npz") as evaluations:
+        assert evaluations["return_adversary"].shape == (2, 3)
+    config = yaml.safe_load(run.config_file.read_text())
+    assert config["env_wrapper"] == [{"supersuit.frame_stack_v2": {"stack_size": 3}}, {"supersuit.pad_observations_v0": {}}]
+
+
+@pytest.mark.filterwarnings("ignore:the state of .* cannot be read")
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_a_run_in_a_world_of_pettingzoo_is_resumed(tmp_path, vec_env):
+    """In new episodes, since the worlds' state cannot be read."""
+    words = mpe_command(tmp_path, "--vec-env", vec_env)
+    assert train.main(words, [SignalAt(100, signal.SIGTERM)]) == 143
+    assert train.main(["--resume", str(tmp_path / "logs" / "maddpg" / "mpe2-simple_tag_v3_1")]) == 0
+    run = RunFolder(tmp_path / "logs" / "maddpg" / "mpe2-simple_tag_v3_1", "mpe2/simple_tag_v3")
+    assert ALGOS["maddpg"].load(run.last_model).num_timesteps == 120
+
+
+def test_our_worlds_train_in_processes(tmp_path):
+    used = []
+
+    class Watch(BaseCallback):
+        def _on_step(self):
+            used.append(type(self.training_env.unwrapped))
+            return True
+
+    words = command(tmp_path, "Grassland-v0", "maddpg", "--vec-env", "subproc", steps=40)
+    assert train.main(words, [Watch()]) == 0
+    assert set(used) == {TracedSubprocVecEnv}
+    assert ALGOS["maddpg"].load(run_folder(tmp_path).last_model).num_timesteps == 40
+
+
+MPE_REFUSALS = [
+    ("--env-kwargs num_god:3", 'unknown setting of mpe2/simple_tag_v3 "num_god"; did you mean "num_good"?'),
+    ("--env-kwargs num_good:many", "setting of mpe2/simple_tag_v3 num_good is 'many'; it must be a whole number"),
+    ("--env-kwargs num_agent_neighbors:0", "num_agent_neighbors must be a positive integer"),
+    ("--eval-env-kwargs num_good:2", "make a world whose agents are not those of the training"),
+]
+
+
+@pytest.mark.parametrize(("words", "sentence"), MPE_REFUSALS, ids=[words for words, _ in MPE_REFUSALS])
+def test_bad_settings_of_a_world_of_pettingzoo_get_one_sentence(tmp_path, capsys, words, sentence):
+    assert train.main(mpe_command(tmp_path, *words.split())) == 2
+    printed = capsys.readouterr().err
+    assert sentence in printed and printed.count("\n") == 1
+    assert not (tmp_path / "logs").exists()

@@ -19,6 +19,8 @@ class ToyParallelEnv(ParallelEnv):
     :param agents: who takes part
     :param time_limit: the step in which the episode is truncated
     :param deaths: the step in which an agent dies
+    :param cuts: the step in which an agent alone is truncated
+    :param joins: the step in which an agent joins the world; all others are there from the start
     :param end: the step in which the world ends for all
     :param discrete: agents choose instead of giving a vector
     :param with_state: whether the world declares a ``state()``
@@ -27,10 +29,21 @@ class ToyParallelEnv(ParallelEnv):
     metadata = {"name": "toy_v0", "render_modes": []}  # noqa: RUF012
     render_mode = None
 
-    def __init__(self, agents=tuple(OBS_SIZES), time_limit=None, deaths=None, end=None, discrete=False, with_state=True):
+    def __init__(
+        self,
+        agents=tuple(OBS_SIZES),
+        time_limit=None,
+        deaths=None,
+        end=None,
+        discrete=False,
+        with_state=True,
+        cuts=None,
+        joins=None,
+    ):
         self.possible_agents = list(agents)
         self.agents = []
         self.time_limit, self.deaths, self.end, self.discrete = time_limit, deaths or {}, end, discrete
+        self.cuts, self.joins = cuts or {}, joins or {}
         self.rng = np.random.default_rng(0)
         self.places = dict.fromkeys(agents, 0.0)
         self.received = []
@@ -53,7 +66,7 @@ class ToyParallelEnv(ParallelEnv):
     def reset(self, seed=None, options=None):
         if seed is not None:
             self.rng = np.random.default_rng(seed)
-        self.agents = list(self.possible_agents)
+        self.agents = [agent for agent in self.possible_agents if agent not in self.joins]
         self.t = 0
         self.places = {agent: self.rng.uniform(-1, 1) for agent in self.possible_agents}
         return self._observations(self.agents), {agent: {} for agent in self.agents}
@@ -67,10 +80,12 @@ class ToyParallelEnv(ParallelEnv):
             self.places[agent] += 0.1 * float(np.ravel(actions[agent])[0])
         ended = self.end == self.t
         terminations = {agent: ended or self.deaths.get(agent) == self.t for agent in acting}
-        truncations = {agent: self.time_limit == self.t for agent in acting}
+        truncations = {agent: self.t in (self.time_limit, self.cuts.get(agent)) for agent in acting}
         rewards = {agent: float((self.possible_agents.index(agent) + 1) * self.t) for agent in acting}
         self.agents = [agent for agent in acting if not (terminations[agent] or truncations[agent])]
-        return self._observations(acting), rewards, terminations, truncations, {agent: {} for agent in acting}
+        joined = [agent for agent, step in self.joins.items() if step == self.t]
+        self.agents += joined
+        return self._observations(acting + joined), rewards, terminations, truncations, {agent: {} for agent in acting}
 
     def state(self):
         return np.array([self.t, *self.places.values()], dtype=np.float32)
@@ -87,3 +102,33 @@ class ToyParallelEnv(ParallelEnv):
 
     def close(self):
         pass
+
+
+class SpacesEnv(ToyParallelEnv):
+    """
+    A scout and a tank with any spaces; it keeps the actions that it is given, and refuses those that are none of its own.
+
+    :param observation_spaces: agent → space
+    :param action_spaces: agent → space
+    :param observations: agent → what it observes; by default drawn from its space
+    :param kwargs: of the toy world
+    """
+
+    def __init__(self, observation_spaces, action_spaces, observations=None, **kwargs):
+        super().__init__(("scout_0", "tank_0"), with_state=False, **kwargs)
+        self._observation_spaces, self._action_spaces, self.observations = (
+            observation_spaces,
+            action_spaces,
+            observations or {},
+        )
+        self.given = None
+
+    def step(self, actions):
+        for agent, action in actions.items():
+            assert self.action_space(agent).contains(action), f"{agent} got {action!r}"
+        self.given = actions
+        return super().step(dict.fromkeys(actions, 0.0))
+
+    def _observations(self, agents):
+        drawn = {agent: self._observation_spaces[agent].sample() for agent in agents}
+        return {agent: self.observations.get(agent, observation) for agent, observation in drawn.items()}

@@ -17,7 +17,9 @@ from sb3_kfcv.common.joint_algorithm import JointAlgorithm
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.schedules import schedule_of
 from sb3_kfcv.maddpg import MADDPG
-from sb3_kfcv.vec_env.make import WORLDS
+from sb3_kfcv.vec_env.make import WORLDS, unknown_environment
+from sb3_kfcv.vec_env.named_worlds import find_world
+from sb3_kfcv.vec_env.named_wrappers import NamedWrapper, find_wrappers, listed_wrappers
 from zoo.run_folder import read_map
 from zoo.typed_settings import checked, resolve_classes, settings_of
 
@@ -49,6 +51,7 @@ OF_THE_RUN = {
     "policy": str,
     "normalize": bool | dict[str, Any],
     "env_kwargs": dict[str, Any],
+    "env_wrapper": str | dict[str, Any] | list | None,
 }
 
 
@@ -64,6 +67,7 @@ class Hyperparams:
     :param policy: name of the policy class
     :param normalize: arguments of ``VecNormalize``; ``None`` goes without
     :param env_kwargs: settings of the world
+    :param env_wrapper: SuperSuit's wrappers around the world, maps name → arguments
     :param model: arguments of the algorithm's constructor, as YAML holds them
     """
 
@@ -74,11 +78,12 @@ class Hyperparams:
     policy: str = "MlpPolicy"
     normalize: dict[str, Any] | None = None
     env_kwargs: dict[str, Any] = field(default_factory=dict)
+    env_wrapper: list[NamedWrapper] = field(default_factory=list)
     model: dict[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as an entry of a YAML file."""
-        run = {name: getattr(self, name) for name in ("n_timesteps", "n_envs", "policy", "env_kwargs")}
+        run = {name: getattr(self, name) for name in ("n_timesteps", "n_envs", "policy", "env_kwargs", "env_wrapper")}
         return {**run, "normalize": self.normalize or False, **self.model}
 
     def model_kwargs(self, names: Sequence[str] | None = None) -> dict[str, Any]:
@@ -143,9 +148,9 @@ def load_entry(algo: str, env_id: str, conf_file: str | Path | None = None, pres
     path = Path(conf_file) if conf_file else HYPERPARAMS / f"{algo}.yml"
     entries = read_map(path)
     if env_id not in entries:
-        if env_id in gym.registry:
+        if env_id in gym.registry or find_world(env_id) is not None:
             raise ValueError(f"{path} has no entry for {env_id}; it has {', '.join(map(str, entries))}")
-        raise ValueError(unknown_name("environment", env_id, [*WORLDS, *gym.registry]))
+        raise ValueError(unknown_environment(env_id))
     entry = entries[env_id]
     if not isinstance(entry, dict):
         raise ValueError(f"the entry of {env_id} in {path} is {entry!r}; it must be a map")
@@ -215,6 +220,8 @@ def check(algo: str, env_id: str, entry: Mapping[str, Any]) -> Hyperparams:
             raise ValueError(f"hyperparameter {name} is {run[name]}; it must be at least 1")
     run["normalize"] = _checked_normalize(run.get("normalize", False))
     run["env_kwargs"] = check_env_kwargs(env_id, run.get("env_kwargs", {}))
+    run["env_wrapper"] = listed_wrappers(run.get("env_wrapper"))
+    find_wrappers(run["env_wrapper"])  # refuses what there is not
     if run.setdefault("policy", "MlpPolicy") not in algorithm.policy_aliases:
         raise ValueError(unknown_name("policy", run["policy"], algorithm.policy_aliases))
     if algo != CO_TRAINING:
@@ -253,13 +260,16 @@ def _checked_model(algo: str, policy: str, settings: Mapping[str, Any]) -> dict[
 
 def check_env_kwargs(env_id: str, env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """
-    Check the settings of one of the project's worlds; those of other envs cannot be known and pass.
+    Check the settings of a world; those of a world that does not name them cannot be known and pass.
 
     :raises ValueError: for an unknown one, with the nearest one, and for a value of another type
     """
-    if env_id not in WORLDS:
+    constructor: Any = WORLDS.get(env_id)
+    if constructor is None and env_id not in gym.registry and (world := find_world(env_id)) is not None:
+        constructor = world.constructor
+    if constructor is None:
         return dict(env_kwargs)
-    return checked(f"setting of {env_id}", env_kwargs, settings_of(WORLDS[env_id], ("self", "n_worlds")))
+    return checked(f"setting of {env_id}", env_kwargs, settings_of(constructor, ("self", "n_worlds")))
 
 
 def _checked_normalize(normalize: bool | dict[str, Any]) -> dict[str, Any] | None:

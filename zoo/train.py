@@ -22,7 +22,7 @@ import torch as th
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor, VecNormalize
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import each other as the package ``zoo``
 
@@ -36,6 +36,7 @@ from sb3_kfcv.saving.checkpoints import Checkpoints, ResumeError, checkpoints_in
 from sb3_kfcv.saving.normalization import load_normalization
 from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import layout_of, make_vec_env, metric_names_of
+from sb3_kfcv.vec_env.named_wrappers import find_wrappers
 from zoo.hyperparams import (
     CO_TRAINING,
     OF_THE_RUN,
@@ -128,6 +129,7 @@ def make_parser() -> Parser:
     pairs: dict[str, Any] = {"nargs": "+", "action": "extend", "default": [], "metavar": "KEY:VALUE"}
     add("-params", "--hyperparams", **pairs, help="overwrite hyperparameters, such as gamma:0.95 policy_kwargs.n_critics:2")
     add("--env-kwargs", **pairs, help="settings of the world, such as n_wolves:4")
+    add("--vec-env", choices=("dummy", "subproc"), default="dummy", help="subproc: each world in a process of its own")
     add("--eval-env-kwargs", **pairs, help="settings of the evaluation's worlds where they differ")
     add("-conf", "--conf-file", help="YAML file of hyperparameters (default: hyperparams/<algo>.yml)")
     add("--preset", help=f"{' or '.join(PRESETS)}: what learns better in place of the paper's values")
@@ -304,7 +306,14 @@ def as_begun(args: argparse.Namespace, given: Sequence[str]) -> tuple[argparse.N
     return begun, folder
 
 
-def make_env(hyperparams: Hyperparams, n_envs: int, seed: int, env_kwargs: dict[str, Any], training: bool) -> VecEnv:
+def make_env(
+    hyperparams: Hyperparams,
+    n_envs: int,
+    seed: int,
+    env_kwargs: dict[str, Any],
+    training: bool,
+    processes: bool = False,
+) -> VecEnv:
     """
     Worlds to train or to evaluate in.
 
@@ -313,8 +322,16 @@ def make_env(hyperparams: Hyperparams, n_envs: int, seed: int, env_kwargs: dict[
     :param seed: of the first world; the others follow
     :param env_kwargs: settings of the worlds
     :param training: whether observation statistics are gathered, if observations are normalised
+    :param processes: each world in a process of its own
     """
-    env = make_vec_env(hyperparams.env_id, n_envs, seed, env_kwargs)
+    env = make_vec_env(
+        hyperparams.env_id,
+        n_envs,
+        seed,
+        env_kwargs,
+        wrappers=find_wrappers(hyperparams.env_wrapper),
+        vec_env_cls=SubprocVecEnv if processes else None,
+    )
     return env if hyperparams.normalize is None else VecNormalize(env, training=training, **hyperparams.normalize)
 
 
@@ -383,7 +400,8 @@ def build(args: argparse.Namespace, resumed: RunFolder | None = None) -> Trainin
     th.set_num_threads(args.num_threads)
     if args.seed < 0:
         args.seed = int(np.random.default_rng().integers(2**31))
-    env = make_env(hyperparams, hyperparams.n_envs, args.seed, hyperparams.env_kwargs, training=True)
+    processes = args.vec_env == "subproc"
+    env = make_env(hyperparams, hyperparams.n_envs, args.seed, hyperparams.env_kwargs, training=True, processes=processes)
     eval_env = make_eval_env(args, hyperparams, env)
     measured = make_yardsticks(args, hyperparams, eval_env)
     algorithm = find_algorithm(args.algo)

@@ -79,13 +79,16 @@ class ParticleParallelEnv(ParallelEnv):
         self, actions: dict[str, Any]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """
-        Move all living agents.
+        Move all living agents. After the end a step without actions does nothing, as in PettingZoo's own worlds: wrappers that
+        keep the dead in their list step once more.
 
         :param actions: one for each agent in ``agents``
         :return: observations, rewards, terminations, truncations, infos of the agents that lived before the step
         :raises ValueError: for an agent without an action, or an action that is none
         """
         worlds, acting = self.worlds, self.agents
+        if not actions and self._is_over():
+            return {}, {}, {}, {}, {}
         worlds.step(self._joined(actions)[np.newaxis])
         rows = [self._index[agent] for agent in acting]
         rewards, terminated = worlds.rewards[0].tolist(), worlds.terminated[0].tolist()
@@ -141,9 +144,13 @@ class ParticleParallelEnv(ParallelEnv):
 
     def _find_living(self) -> None:
         """Set ``agents`` to those that take part in the next step: none once the episode has ended."""
-        over = self.worlds.episode_truncated[0] or self.worlds.episode_terminated[0]
         alive = self.worlds.alive[0].tolist()
-        self.agents = [] if over else [agent for agent, lives in zip(self.possible_agents, alive, strict=True) if lives]
+        self.agents = (
+            [] if self._is_over() else [agent for agent, lives in zip(self.possible_agents, alive, strict=True) if lives]
+        )
+
+    def _is_over(self) -> bool:
+        return bool(self.worlds.episode_truncated[0] or self.worlds.episode_terminated[0])
 
     def _observations(self, agents: list[str]) -> dict[str, np.ndarray]:
         row = self.worlds.observations[0].copy()

@@ -349,9 +349,9 @@ class MADDPG(JointAlgorithm):
 
         :return: (agents, batch), the learning agents
         """
-        continues = 1 - batch.dones  # (batch, agents)
+        continues = 1 - batch.dones  # (batch, agents): also of one that has joined in this step
         next_actions = self._target_actions(batch.next_observations)
-        next_inputs = self._critic_inputs(batch.next_observations, batch.next_states, next_actions, batch.alive * continues)
+        next_inputs = self._critic_inputs(batch.next_observations, batch.next_states, next_actions, continues)
         next_q_values = self.critic_target.evaluate(next_inputs).amin(0)
         rewards = batch.rewards if self.reward_scale == 1 else self.reward_scale * batch.rewards
         rewards, continues = rewards.T[self._learning], continues.T[self._learning]
