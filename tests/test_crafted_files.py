@@ -8,6 +8,7 @@ import io
 import json
 import os
 import pickle
+import shutil
 import struct
 import subprocess
 import sys
@@ -21,6 +22,7 @@ import pytest
 import torch as th
 from crafted import (
     ALGORITHMS,
+    CURRICULUM,
     array,
     assert_one_sentence,
     drop,
@@ -43,13 +45,15 @@ from hypothesis import strategies as st
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_kfcv import KFCVMADDPG, FileFormatError, KFCVReplayBuffer, MlpPolicy
+from sb3_kfcv import KFCVMADDPG, CoTraining, FileFormatError, KFCVReplayBuffer, MlpPolicy
+from sb3_kfcv.common.actors import ActorPolicy
 from sb3_kfcv.common.checks import NonFiniteError
 from sb3_kfcv.saving import values
 from sb3_kfcv.saving.archive import MANIFEST
-from sb3_kfcv.saving.checkpoints import Checkpoint
+from sb3_kfcv.saving.checkpoints import Checkpoint, Checkpoints
 from sb3_kfcv.saving.normalization import load_normalization
 from sb3_kfcv.saving.run_state import random_state, set_random_state
+from sb3_kfcv.teams.players import Mixture, load_player
 
 ROOT = Path(__file__).resolve().parents[1]
 MODEL_FILES = ("model", "buffer", "checkpoint")
@@ -251,6 +255,7 @@ ATTRIBUTES = {
     "critic_input that is none": [put(A, "critic_input", to="everything")],
     "a team that is none": [put(A, "team", to="nobody")],
     "opponents that are none": [put(A, "team", to="tank"), put(A, "opponents", to={"scout": "os.system"})],
+    "opponents of nobody": [put(A, "opponents", to={"wall": "random"})],
     "_last_obs of another world": [array("attributes/_last_obs", lambda rows: rows[:, :3])],
     "_last_obs a text": [put(A, "_last_obs", to="x")],
     "ep_info_buffer a list": [put(A, "ep_info_buffer", to=[])],
@@ -591,6 +596,228 @@ def test_a_generator_beyond_its_numbers_is_refused(trained, pos):
     state["numpy"]["state"]["pos"] = pos
     with pytest.raises(ValueError, match="NumPy's generator"):
         set_random_state(trained["kfcv"], state)
+
+
+# ---- teams and players
+
+OPPONENT = (A, "opponents", "tank")
+OPPONENT_ARRAYS = "attributes/opponents/tank"
+
+
+def make_teams(**settings):
+    """Co-training of a few dozen weights against its own past."""
+    own = {"learning_starts": 10, "batch_size": 8, "buffer_size": 50, "policy_kwargs": {"net_arch": [4]}}
+    teams = {"scout": {"algo": "kfcv_maddpg", **own, "replay_buffer_kwargs": CURRICULUM}, "tank": {"algo": "maddpg", **own}}
+    return CoTraining("MlpPolicy", toy(), teams, seed=0, device="cpu", pool_share=0.5, pool_freq=10, **settings)
+
+
+@pytest.fixture(scope="module")
+def players(tmp_path_factory):
+    """Files of a team against a saved opponent, of a mixture of such, of a co-training, and of a player alone."""
+    folder = tmp_path_factory.mktemp("players")
+    saved = ActorPolicy.of(make("maddpg").policy)
+    saved.save(folder / "player.zip")
+    for name, opponent in (("saved", saved), ("mixed", Mixture([saved, "random"], [2, 1]))):
+        make("maddpg", team="scout", opponents={"tank": opponent}).save(folder / name)
+    teams = make_teams()
+    teams.learn(30, Checkpoints(folder / "run", save_freq=12))
+    teams.save(folder / "teams")
+    return folder
+
+
+SOMEBODY = "PLAYER.zip"  # stands for the path of a file that would do
+OPPONENTS = {
+    **{"a path": SOMEBODY, "no file": "other.zip", "a number": 3, "nobody": None, "a class": named("MlpPolicy")},
+    **{"a map of paths": {SOMEBODY: 1}, "a list of paths": [SOMEBODY], "a list": ["random", "random"]},
+    **{"a tuple": {"$": "tuple", "items": [SOMEBODY]}, "a space": {"$": "MultiDiscrete", "nvec": named("relu")}},
+    **{"a queue": {"$": "deque", "items": ["random"], "maxlen": None}, "a schedule": {"$": "ConstantSchedule", "val": 1}},
+    **{
+        f"a mixture of {what}": {"$": "Mixture", "players": players, "weights": weights}
+        for what, players, weights in (
+            *(("a path", [SOMEBODY], [1]), ("nobody", [], []), ("numbers", [3], [1]), ("a text", "random", [1])),
+            *(("few weights", ["random"], []), ("no weight", ["random"], [0]), ("less", ["random"], [-1])),
+            *(("weights of texts", ["random"], ["1"]), ("weights of lists", ["random"], [[1]])),
+            *(("a mixture", [{"$": "Mixture", "players": ["random"], "weights": [1]}], [1]), ("maps", [{}], [1])),
+            *(("lists", [[SOMEBODY]], [1]), ("unknown scripts", ["chase"], [1])),
+        )
+    },
+    "a mixture of more": {"$": "Mixture", "players": ["random"], "weights": [1], "rng": 1},
+}
+
+
+@pytest.mark.parametrize("what", OPPONENTS)
+def test_crafted_opponents_are_none(players, what, tmp_path):
+    """A file has no say about other files, even where they would do."""
+    text = json.dumps(OPPONENTS[what]).replace(SOMEBODY, str(players / "player.zip"))
+    edit = put(*OPPONENT, to=json.loads(text))
+    assert "attributes" in refused(tampered(players / "saved.zip", tmp_path / "model.zip", edit), ALGORITHMS["maddpg"].load)
+
+
+def of_every_player(section, *place, arrays):
+    """What can be wrong with actors in a file, at their place in it."""
+
+    def whole(value):
+        return put(section, *place, to=value) if place else raw(f"{section}.json", json.dumps(value).encode())
+
+    weight = f"{arrays}/parameters/stacks.0.first.weight"
+    return {
+        **{f"without {name}": [drop(section, *place, name)] for name in ("layout", "agents", "net_arch", "parameters")},
+        "more": [put(section, *place, "run", to="rm")],
+        "nothing": [whole(None)],
+        "a map": [whole({})],
+        "a text": [whole("x.zip")],
+        "a layout": [put(section, *place, "$", to="AgentLayout")],
+        "weights with NaN": [array(weight, number(np.nan))],
+        "weights beyond all numbers": [array(weight, number(np.inf))],
+        "weights of another shape": [array(weight, lambda values: values[:, :1].copy())],
+        "weights of another type": [array(weight, lambda values: values.astype(np.float64))],
+        "weights of nothing": [array(weight, lambda values: values[:0].copy())],
+        "weights of another name": [put(section, *place, "parameters", "other", to={"$": "tensor", "name": f"{weight}.npy"})],
+        "parameters that are none": [put(section, *place, "parameters", to=[1])],
+        "parameters of a text": [put(section, *place, "parameters", "stacks.0.first.weight", to="1")],
+        "no parameters": [put(section, *place, "parameters", to={})],
+        "nobody": [put(section, *place, "agents", to=[])],
+        "an agent beyond": [put(section, *place, "agents", to=[0, 1, 2, 3])],
+        "an agent before": [put(section, *place, "agents", to=[-1, 0, 1])],
+        "an agent twice": [put(section, *place, "agents", to=[0, 0, 1, 2])],
+        "an agent of a text": [put(section, *place, "agents", to=["0"])],
+        "agents that are a number": [put(section, *place, "agents", to=3)],
+        "agents in another order": [put(section, *place, "agents", to=[2, 1, 0])],
+        "fewer agents": [put(section, *place, "agents", to=[0, 1])],
+        "another layout": [put(section, *place, "layout", "obs_sizes", to=[3, 2, 3])],
+        "a huge layout": [put(section, *place, "layout", "obs_sizes", to=[HUGE, 3, 2])],
+        "huge layers": [put(section, *place, "net_arch", to=[10**9, 10**9])],
+        "large layers": [put(section, *place, "net_arch", to=[30_000])],
+        "100,000 layers": [put(section, *place, "net_arch", to=[1] * 100_000)],
+        "layers of nothing": [put(section, *place, "net_arch", to=[0])],
+        "layers of a text": [put(section, *place, "net_arch", to="4")],
+        "layers of halves": [put(section, *place, "net_arch", to=[4.5])],
+        "an activation that is a loss": [put(section, *place, "activation_fn", to=named("adam"))],
+        "an activation that is a text": [put(section, *place, "activation_fn", to="relu")],
+        "an activation that no one knows": [put(section, *place, "activation_fn", to=named("os.system"))],
+        "sharing perhaps": [put(section, *place, "share_parameters", to="no")],
+        "sharing": [put(section, *place, "share_parameters", to=True)],
+        "spaces upside down": [array(f"{arrays}/action_space/low", lambda low: 3 - low)],
+    }
+
+
+@parametrized(of_every_player("player", arrays="player") | {"JSON": [raw("player.json", b"[")]})
+def test_crafted_players_are_refused(players, edits, tmp_path):
+    path = tampered(players / "player.zip", tmp_path / "player.zip", *edits)
+    with within_memory(150e6):
+        refused(path, load_player)
+        refused(path, ActorPolicy.load)
+
+
+@parametrized(of_every_player(*OPPONENT, arrays=OPPONENT_ARRAYS))
+def test_crafted_opponents_are_refused(players, edits, tmp_path):
+    with within_memory(150e6):
+        refused(tampered(players / "saved.zip", tmp_path / "model.zip", *edits), ALGORITHMS["maddpg"].load)
+
+
+MIXED = (*OPPONENT, "players", 0)
+
+
+@parametrized(of_every_player(*MIXED, arrays=f"{OPPONENT_ARRAYS}/players/0"))
+def test_crafted_players_of_mixtures_are_refused(players, edits, tmp_path):
+    refused(tampered(players / "mixed.zip", tmp_path / "model.zip", *edits), ALGORITHMS["maddpg"].load)
+
+
+S = "teams"
+TEAM_SECTIONS = {
+    "nothing": [raw("teams.json", b"{}")],
+    "no section": [lambda members: members.pop("teams.json")],
+    "a list": [raw("teams.json", b'["scout", "tank"]')],
+    "a text": [raw("teams.json", b'"scout"')],
+    "null": [raw("teams.json", b"null")],
+    "one team": [drop(S, "tank")],
+    "more teams": [put(S, "wall", to={})],
+    "the teams in another order": [lambda members: put_first(members, "tank")],
+    "a team of nothing": [put(S, "tank", to={})],
+    "a team of null": [put(S, "tank", to=None)],
+    "a team of a list": [put(S, "tank", to=[["algorithm", "MADDPG"]])],
+    "a team of a player": [put(S, "tank", to={"$": "Mixture", "players": ["random"], "weights": [1]})],
+    "another algorithm": [put(S, "tank", "algorithm", to="PERMADDPG")],
+    "an algorithm of a list": [put(S, "tank", "algorithm", to=["MADDPG"])],
+    **{
+        f"without {name}": [drop(S, "tank", name)] for name in ("algorithm", "layout", "action_space", "n_envs", "buffer_size")
+    },
+    **{
+        f"{name} shadows what the model makes": [put(S, "tank", name, to=1)]
+        for name in (
+            "policy",
+            "actor",
+            "critic_target",
+            "_watch",
+            "_opponent_policy",
+            "agents",
+            "_parameters",
+            "replay_buffer",
+        )
+    },
+    **{f"{name} shadows a method": [put(S, "tank", name, to=1)] for name in ("predict", "train", "__class__")},
+    **{
+        f"another {name}": [put(S, "tank", name, to=value)]
+        for name, value in {
+            **{"team": "scout", "critic_input": "state", "share_parameters": True, "stores_state": True, "buffer_size": 49},
+            **{"policy_kwargs": {"net_arch": [5]}, "policy_class": named("relu"), "replay_buffer_kwargs": {"seed": 3}},
+            **{"gamma": 2, "tau": "x", "n_envs": 0, "num_timesteps": -1, "action_noise": 3, "batch_size": 0},
+            **{"learning_rate": "lin_x", "opponents": {"scout": "x.zip"}, "_last_obs": [1], "_episode_metrics": 3},
+        }.items()
+    },
+    "another layout": [put(S, "tank", "layout", "groups", to=["scout", "tank", "tank"])],
+    "another space": [array("teams/tank/action_space/high", lambda high: 2 * high)],
+    "a team that is no group": [put(A, "teams", to={"wall": {"algo": "maddpg"}})],
+    "an algorithm that is a path": [put(A, "teams", "tank", "algo", to="x.zip")],
+    "an algorithm that is a class": [put(A, "teams", "tank", "algo", to=named("relu"))],
+    "settings that are none": [put(A, "teams", "tank", to=[1])],
+    "settings of the whole": [put(A, "teams", "tank", "opponents", to={"scout": "x.zip"})],
+    "opponents of a team": [put(A, "opponents", to={"tank": "x.zip"})],
+    "past selves in half": [put(A, "pool_share", to=1.5)],
+    **{f"JSON: {name}": [raw("teams.json", data)] for name, data in NOT_JSON.items()},
+}
+
+
+def put_first(members, team):
+    teams = json.loads(members["teams.json"])
+    members["teams.json"] = json.dumps({team: teams.pop(team), **teams}).encode()
+
+
+@parametrized(TEAM_SECTIONS)
+def test_crafted_sections_of_teams_are_refused(players, edits, tmp_path):
+    refused(tampered(players / "teams.zip", tmp_path / "teams.zip", *edits), CoTraining.load)
+
+
+@pytest.mark.parametrize("what", ["layers", "a buffer", "a pool of junk", "a pool of others", "a pool of minus", "opponents"])
+def test_crafted_checkpoints_of_teams_are_refused(players, what, tmp_path):
+    pool = ("training", "learner", "pools", "tank")
+    edits = {
+        "layers": [put(A, "teams", "tank", "policy_kwargs", "net_arch", to=[10**6] * 3)],
+        "a buffer": [put("replay_buffer", "teams", to={})],
+        "a pool of junk": [put(*pool, "past", to=["random"] * 3)],
+        "a pool of others": [lambda members: exchange(members, "scout", "tank")],
+        "a pool of minus": [array("/".join((*pool, "games")), lambda games: games - 9)],
+        "opponents": [put(A, "opponents", to={"wall": "other.zip"})],
+    }
+    shutil.copytree(players / "run", tmp_path / "run")
+    path = tmp_path / "run" / "rl_model_30_steps.zip"
+    tampered(path, path, *edits[what])
+    with within_memory(150e6), pytest.raises(ValueError) as caught:
+        make_teams().learn(60, Checkpoints(tmp_path / "run", 12, resume=True))
+    assert "rl_model_30_steps.zip" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def exchange(members, one, other):
+    """The pools of two teams, each in the other's place."""
+    training = json.loads(members["training.json"])
+    pools = training["learner"]["pools"]
+    pools[one], pools[other] = pools[other], pools[one]
+    members["training.json"] = json.dumps(training).encode()
+
+
+def test_a_file_of_several_learners_gives_no_player_of_junk(players, tmp_path):
+    for edit in (raw("teams.json", b"[1]"), put(S, "tank", to={}), put(S, "tank", "layout", to=3), drop(P, "policy.1")):
+        refused(tampered(players / "teams.zip", tmp_path / "teams.zip", edit), lambda path: load_player(path, "tank"))
 
 
 # ---- statistics of normalised worlds

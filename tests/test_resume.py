@@ -42,11 +42,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_zoo import ROOT, SignalAt, command, run_folder
 from toy_envs import ToyParallelEnv
 
-from sb3_kfcv import ALGOS, KFCVMADDPG, MADDPG, PERMADDPG, make_vec_env
-from sb3_kfcv.common.callbacks import MultiAgentEvalCallback, StopOnSignal
+from sb3_kfcv import ALGOS, KFCVMADDPG, MADDPG, PERMADDPG, CoTraining, make_vec_env
+from sb3_kfcv.common.actors import ActorPolicy
+from sb3_kfcv.common.callbacks import MultiAgentEvalCallback, SavePlayers, StopOnSignal
 from sb3_kfcv.envs import grassland_v0
 from sb3_kfcv.saving import checkpoints
 from sb3_kfcv.saving.checkpoints import Checkpoint, Checkpoints, checkpoints_in
+from sb3_kfcv.teams.players import Mixture, RandomPlayer
 from sb3_kfcv.vec_env.make import make_joint_env
 from zoo import train
 from zoo.run_folder import RunFolder
@@ -101,7 +103,7 @@ def series(path):
     entries = {tag: [(event.step, event.value) for event in events.Scalars(tag)] for tag in tags["scalars"]}
     for tag in tags["histograms"]:
         entries[tag] = [(event.step, event.histogram_value.sum) for event in events.Histograms(tag)]
-    return {tag: sorted(values) for tag, values in entries.items() if tag not in WALL_CLOCK}
+    return {tag: sorted(values) for tag, values in entries.items() if re.sub(r"_\w+/", "/", tag) not in WALL_CLOCK}
 
 
 def episodes(path):
@@ -247,6 +249,27 @@ def drifting_noise():
     return OrnsteinUhlenbeckActionNoise(np.zeros(8), np.full(8, 0.2), dtype=np.float32)
 
 
+def teams(wolf=MADDPG, sheep=MADDPG, env=None, of_wolf=(), of_sheep=(), **settings):
+    """Co-training of small learners, of which the second one starts later."""
+    own = {"wolf": {"algo": wolf, **dict(of_wolf)}, "sheep": {"algo": sheep, "learning_starts": 40, **dict(of_sheep)}}
+    of_all = {"learning_starts": 20, "batch_size": 8, "buffer_size": 200, "policy_kwargs": {"net_arch": [8]}}
+    for theirs in own.values():
+        theirs.update({"replay_buffer_kwargs": CURRICULUM} if theirs["algo"] is KFCVMADDPG else {}, **{**of_all, **theirs})
+    return CoTraining("MlpPolicy", env or grassland(), own, seed=1, device="cpu", **settings)
+
+
+def three_teams(**settings):
+    """A group that learns, one that acts at random, and one that plays a mixture."""
+    own = {"alpha": {"algo": MADDPG, "learning_starts": 20, "batch_size": 8, "buffer_size": 200}}
+    env = make_vec_env(ThreeToys, 2)
+    opponents = {"beta": "random", "gamma": Mixture([RandomPlayer(env.action_space, np.random.default_rng(8)), "random"])}
+    return CoTraining("MlpPolicy", env, own, opponents, seed=1, device="cpu", **settings)
+
+
+def saved_sheep(seed=7):
+    return ActorPolicy.of(MADDPG("MlpPolicy", grassland(), seed=seed, device="cpu", policy_kwargs={"net_arch": [8]}).policy)
+
+
 class SavedToy(ToyParallelEnv):
     def get_state(self):
         rng = self.rng.bit_generator.state
@@ -255,6 +278,29 @@ class SavedToy(ToyParallelEnv):
     def set_state(self, saved):
         self.t, self.places, self.agents = saved["step"], dict(saved["places"]), list(saved["agents"])
         self.rng.bit_generator.state = saved["rng"]
+
+
+class ThreeToys(SavedToy):
+    """Each agent is a group of its own."""
+
+    NAMES = {"alpha": "scout_0", "beta": "scout_1", "gamma": "tank_0"}  # noqa: RUF012
+
+    def __init__(self):
+        super().__init__(time_limit=6)
+        self.possible_agents = list(self.NAMES)
+        self.places = dict.fromkeys(self.NAMES, 0.0)
+
+    def observation_space(self, agent):
+        return super().observation_space(self.NAMES[agent])
+
+    def action_space(self, agent):
+        return super().action_space(self.NAMES[agent])
+
+    def _observations(self, agents):
+        rows = {agent: np.zeros(self.observation_space(agent).shape, np.float32) for agent in agents}
+        for agent, row in rows.items():
+            row[:2] = self.places[agent], self.t
+        return rows
 
 
 def toy(**kwargs):
@@ -312,6 +358,22 @@ SETUPS = {
     "gym env": lambda: small(MADDPG, gym.make("HardSpread-v0", **SPREAD)),
     "gym id": lambda: small(MADDPG, "HardSpread-v0"),
     "own ParallelEnv": lambda: small(PERMADDPG, toy()),
+    "a saved opponent": lambda: small(MADDPG, grassland(), team="wolf", opponents={"sheep": saved_sheep()}),
+    "a mixture of opponents": lambda: small(
+        KFCVMADDPG, grassland(), team="wolf", opponents={"sheep": Mixture([saved_sheep(), "random", "flee"], [2, 1, 1])}
+    ),
+    "teams": lambda: teams(KFCVMADDPG, PERMADDPG),
+    "teams, discrete": lambda: teams(PERMADDPG, KFCVMADDPG, grassland(continuous_actions=False)),
+    "teams and their past": lambda: teams(MADDPG, PERMADDPG, pool_share=0.5, pool_freq=20, pool_size=2),
+    "teams and their past by wins": lambda: teams(
+        KFCVMADDPG, MADDPG, pool_share=0.5, pool_freq=20, pool_size=3, pool_sampling="win_rate"
+    ),
+    "teams with drifting noise": lambda: teams(of_wolf={"action_noise": drifting_noise(), "gradient_steps": -1}),
+    "teams in one world": lambda: teams(
+        MADDPG, PERMADDPG, grassland(1), *[{"train_freq": (2, "episode"), "gradient_steps": -1}] * 2
+    ),
+    "teams of other buffers": lambda: teams(of_wolf={"buffer_size": 30}, of_sheep={"critic_input": "state"}),
+    "a team among random ones": three_teams,
     "own ParallelEnvs, discrete": lambda: small(KFCVMADDPG, make_vec_env(lambda: toy(discrete=True), 2)),
 }
 
@@ -347,6 +409,96 @@ def test_sb3s_callbacks_go_on_exactly(tmp_path, progress_bar):
         assert_equal_arrays(tmp_path / "whole" / name, tmp_path / "cut" / name)
     for name in ("best/best_model.zip", "own/best_model.zip", "models/rl_model_120_steps.zip"):
         assert_same_contents(tmp_path / "whole" / name, tmp_path / "cut" / name)
+
+
+def yardsticks(folder):
+    """Evaluations against players that draw."""
+    return [
+        *(
+            MultiAgentEvalCallback(
+                *(grassland(2, seed=70), 30, 4, folder, folder),
+                **{"team": team, "opponents": {other: opponent}, "name": f"{team}_vs_{i}", "verbose": 0},
+            )
+            for i, (team, other, opponent) in enumerate(
+                [("wolf", "sheep", "random"), ("wolf", "sheep", [saved_sheep(), "flee"]), ("sheep", "wolf", {"chase": 1})]
+            )
+        ),
+        MultiAgentEvalCallback(grassland(2, seed=80), 30, 2, folder, verbose=0),
+        SavePlayers(folder / "players", 30),
+    ]
+
+
+def test_evaluations_of_teams_go_on_exactly(tmp_path):
+    assert_exact(tmp_path, lambda: teams(pool_share=0.5, pool_freq=20), kills=(75, 110), callbacks=yardsticks)
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    written = sorted(path.name for path in whole.glob("evaluations*.npz"))
+    assert written == ["evaluations.npz", *(f"evaluations_{name}.npz" for name in ("sheep_vs_2", "wolf_vs_0", "wolf_vs_1"))]
+    for name in written:
+        assert_equal_arrays(whole / name, cut / name)
+    players = {f"{team}_{steps}_steps.zip" for team in ("wolf", "sheep") for steps in (0, 30, 60, 90, 120)}
+    for folder in (whole, cut):
+        assert {path.name for path in (folder / "players").iterdir()} == players
+    for name in (*(f"players/{player}" for player in players), "best_wolf.zip", "best_sheep.zip"):
+        assert_same_contents(whole / name, cut / name)
+
+
+@pytest.mark.parametrize("kind", ["a team", "teams"])
+def test_a_training_goes_on_against_its_opponents_as_they_were(tmp_path, kind):
+    """Whatever their files hold by now."""
+    file = tmp_path / "opponent.zip"
+
+    def make():
+        mixture = {"sheep": {str(file): 2, "random": 1}}
+        if kind == "a team":
+            return small(MADDPG, grassland(), team="wolf", opponents=mixture)
+        learner = {"algo": "maddpg", "learning_starts": 20, "batch_size": 8, "buffer_size": 200}
+        return CoTraining("MlpPolicy", grassland(), {"wolf": learner}, mixture, seed=1, device="cpu")
+
+    saved_sheep(7).save(file)
+    learn(make(), tmp_path / "whole")
+    with killed():
+        learn(make(), tmp_path / "cut", kill=90)
+    saved_sheep(8).save(file)
+    learn(make(), tmp_path / "cut")
+    learn(make(), tmp_path / "another")
+    assert_equal_checkpoints(tmp_path / "whole", tmp_path / "cut")
+    with pytest.raises(AssertionError):
+        assert_equal_checkpoints(tmp_path / "whole", tmp_path / "another")
+
+
+def test_a_live_opponent_is_the_programs(tmp_path):
+    """It may have learnt on: that is for whoever trains it to restore."""
+
+    def make(opponent):
+        return small(MADDPG, grassland(), team="wolf", opponents={"sheep": opponent})
+
+    live = small(MADDPG, grassland())
+    with killed():
+        learn(make(live), tmp_path, kill=90)
+    model = learn(make(live.learn(60)), tmp_path)
+    assert model._opponent_policy.players["sheep"] is live
+
+
+OTHER_OPPONENTS = {
+    "sheep was played by flee; here it is played by graze": ("flee", "graze"),
+    "sheep was played by flee; here it is played by a model": ("flee", saved_sheep()),
+    "sheep was played by a model; here it is played by random": (saved_sheep(), "random"),
+    r"sheep was played by a mixture of flee, graze \(weights 1, 2\); here it is played by flee": (
+        *({"flee": 1, "graze": 2}, "flee"),
+    ),
+    r"played by a mixture of flee, graze \(weights 1, 2\); here it is played by a mixture of flee, graze \(weights 2, 1\)": (
+        *({"flee": 1, "graze": 2}, {"flee": 2, "graze": 1}),
+    ),
+    "sheep was played by graze; here it is played by random": ({"flee": 1, "graze": 2}, {"flee": 1, "random": 2}),
+}
+
+
+@pytest.mark.parametrize("sentence", OTHER_OPPONENTS)
+def test_a_training_does_not_go_on_against_others(tmp_path, sentence):
+    then, now = OTHER_OPPONENTS[sentence]
+    learn(small(MADDPG, grassland(), team="wolf", opponents={"sheep": then}), tmp_path, steps=40)
+    with pytest.raises(checkpoints.ResumeError, match=f"rl_model_40_steps.zip is of a training against others: .*{sentence}"):
+        learn(small(MADDPG, grassland(), team="wolf", opponents={"sheep": now}), tmp_path)
 
 
 def test_a_callback_that_ends_the_training_ends_it_at_the_same_step(tmp_path):
@@ -679,6 +831,7 @@ OTHERS = {
         MADDPG, grassland(), learning_rate="lin_1e-3"
     ),
     "is of another world: 2 wolf (22 observed, 2 acting), 2 sheep": lambda: small(MADDPG, grassland(n_wolves=3)),
+    "is of MADDPG; this model is a CoTraining": teams,
     "is of another world: 2 wolf": lambda: small(MADDPG, make_vec_env("HardSpread-v0", 2, env_kwargs=SPREAD)),
     "the worlds were wrapped as VecMonitor of ParticleVecEnv; here is a DummyVecEnv": lambda: small(
         MADDPG, DummyVecEnv([lambda: make_joint_env("Grassland-v0", **GRASSLAND)] * 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,7 +71,13 @@ class Yardstick(NamedTuple):
     opponents: dict[str, Any]
 
 
-def yardsticks(words: Sequence[str], layout: AgentLayout, learners: Sequence[str], default: bool) -> list[Yardstick]:
+def yardsticks(
+    words: Sequence[str],
+    layout: AgentLayout,
+    learners: Sequence[str],
+    default: bool,
+    then: Mapping[str, dict[str, Any]] | None = None,
+) -> list[Yardstick]:
     """
     What every learning team is measured by: each player of ``--yardstick``; where the other groups are several, the further
     ones are played by their first.
@@ -79,6 +86,7 @@ def yardsticks(words: Sequence[str], layout: AgentLayout, learners: Sequence[str
     :param layout: who sits where
     :param learners: the groups that learn
     :param default: without words, take every scripted policy of the world
+    :param then: yardsticks by name as they were when a run was begun that is now resumed: their files may be gone
     :raises ValueError: for a word that is none, or an unknown group
     """
     given: dict[str, list[str]] = {}
@@ -92,15 +100,24 @@ def yardsticks(words: Sequence[str], layout: AgentLayout, learners: Sequence[str
     if not given and not default:
         return []
     players = {group: given.get(group) or with_some_sense(scripted_for(layout, group)) for group in layout.group_names}
-    found = []
+    found: list[Yardstick] = []
     for team in learners:
         others = [group for group in layout.group_names if group != team]
-        first = {group: parse_player(players[group][0]) for group in others}
         for group in others:
             for player in players[group] if not given or group in given else ():
-                name = f"{team}_vs_{label(player)}"
-                found.append(Yardstick(team, name, {**first, group: parse_player(player)}))
+                name = _unlike(f"{team}_vs_{label(player)}", [yardstick.name for yardstick in found])
+                opponents = (then or {}).get(name)
+                if opponents is None:
+                    playing = {**{other: players[other][0] for other in others}, group: player}
+                    opponents = {other: parse_player(who) for other, who in playing.items()}
+                found.append(Yardstick(team, name, opponents))
     return found
+
+
+def _unlike(name: str, taken: Sequence[str]) -> str:
+    """The name, with a number where it is taken: files of several runs have the same one."""
+    numbered = (f"{name}_{i}" for i in count(2))
+    return name if name not in taken else next(other for other in numbered if other not in taken)
 
 
 def with_some_sense(names: Sequence[str]) -> list[str]:
@@ -125,9 +142,10 @@ def with_teams(settings: Mapping[str, Any], pairs: Mapping[str, Any], own: Seque
     changed = dict(settings)
     for name, value in pairs.items():
         if name in teams:
-            teams[name] = merged(teams[name], value)
+            teams[name] = merged(teams[name], value) if isinstance(value, dict) else value  # which is refused by its name
         elif name in own:
             changed = merged(changed, {name: value})
         else:
-            teams = {team: merged(theirs, {name: value}) for team, theirs in teams.items()}
+            maps = {team: theirs for team, theirs in teams.items() if isinstance(theirs, dict)}
+            teams = {**teams, **{team: merged(theirs, {name: value}) for team, theirs in maps.items()}}
     return {**changed, "teams": teams}

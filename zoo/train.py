@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,8 +32,10 @@ from sb3_kfcv.common.checks import NonFiniteError
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.patient_logs import PatientResultsWriter
 from sb3_kfcv.maddpg import MADDPG
-from sb3_kfcv.saving.checkpoints import Checkpoints, ResumeError, checkpoints_in, latest_checkpoint
+from sb3_kfcv.saving import FileFormatError
+from sb3_kfcv.saving.checkpoints import Checkpoint, Checkpoints, ResumeError, checkpoints_in, latest_checkpoint
 from sb3_kfcv.saving.normalization import load_normalization
+from sb3_kfcv.saving.saveable import refusals
 from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import layout_of, make_vec_env, metric_names_of
 from sb3_kfcv.vec_env.named_wrappers import find_wrappers
@@ -357,13 +359,16 @@ def make_eval_env(args: argparse.Namespace, hyperparams: Hyperparams, env: VecEn
     return eval_env
 
 
-def make_yardsticks(args: argparse.Namespace, hyperparams: Hyperparams, eval_env: VecEnv | None) -> list[Yardstick]:
+def make_yardsticks(
+    args: argparse.Namespace, hyperparams: Hyperparams, eval_env: VecEnv | None, then: Mapping[str, dict[str, Any]]
+) -> list[Yardstick]:
     """
     Fixed opponents of the evaluation.
 
     :param args: the command line
     :param hyperparams: the settings
     :param eval_env: its worlds, if there are any
+    :param then: those of a run that is resumed, by name
     :raises ValueError: for one that cannot play
     """
     team = hyperparams.model.get("team")
@@ -373,19 +378,43 @@ def make_yardsticks(args: argparse.Namespace, hyperparams: Hyperparams, eval_env
     if eval_env is None or not learners:
         return []
     layout = layout_of(eval_env)
-    found = yardsticks(args.yardstick, layout, learners, default=args.algo == CO_TRAINING)
+    found = yardsticks(args.yardstick, layout, learners, args.algo == CO_TRAINING, then)
     for team, _, opponents in found:
         others = [group for group in layout.group_names if group != team]
         TeamPolicy(layout, opponents, groups=others, action_space=eval_env.action_space)  # refuses who cannot play
     return found
 
 
-def build(args: argparse.Namespace, resumed: RunFolder | None = None) -> Training:
+@dataclass
+class Opponents:
+    """
+    Who played in a run that is resumed: the files from which they came may be others by now, or gone.
+
+    :param training: of the training, by group
+    :param yardsticks: of the evaluations, by name and group
+    """
+
+    training: dict[str, Any] = field(default_factory=dict)
+    yardsticks: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, checkpoint: Checkpoint | None) -> Opponents:
+        """Those that a checkpoint holds."""
+        if checkpoint is None:
+            return cls()
+        with refusals(checkpoint, "training"):
+            states = [state["values"] for state in checkpoint.training["callbacks"]]
+            measured = {values["name"]: values["players"] for values in states if values.get("players")}
+            return cls(dict(checkpoint.attributes.get("opponents") or {}), measured)
+
+
+def build(args: argparse.Namespace, resumed: RunFolder | None = None, then: Opponents | None = None) -> Training:
     """
     Everything that can be refused, before anything is written.
 
     :param args: the command line
     :param resumed: the folder of the run, if it goes on
+    :param then: who has played in it
     :raises ValueError: one sentence that says what is wrong
     """
     if args.num_threads < 1:
@@ -397,15 +426,18 @@ def build(args: argparse.Namespace, resumed: RunFolder | None = None) -> Trainin
     if args.player_freq is not None and args.player_freq < 1 and args.player_freq != -1:
         raise ValueError(f"--player-freq is {args.player_freq}; it must be at least 1, or -1")
     hyperparams = check(args.algo, args.env, read_map(resumed.config_file)) if resumed else resolve(args)
+    then = then or Opponents()
     th.set_num_threads(args.num_threads)
     if args.seed < 0:
         args.seed = int(np.random.default_rng().integers(2**31))
     processes = args.vec_env == "subproc"
     env = make_env(hyperparams, hyperparams.n_envs, args.seed, hyperparams.env_kwargs, training=True, processes=processes)
     eval_env = make_eval_env(args, hyperparams, env)
-    measured = make_yardsticks(args, hyperparams, eval_env)
+    measured = make_yardsticks(args, hyperparams, eval_env, then.yardsticks)
     algorithm = find_algorithm(args.algo)
     settings = {**hyperparams.model_kwargs(), "seed": args.seed, "device": args.device, "verbose": args.verbose}
+    if then.training:
+        settings["opponents"] = then.training
     if not args.trained_agent or (resumed and checkpoints_in(resumed.path)):
         model = algorithm(hyperparams.policy, env, **settings)
         return Training(args, hyperparams, model, eval_env, hyperparams.n_timesteps, measured)
@@ -523,7 +555,7 @@ def train(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseC
             )
         except KeyboardInterrupt:
             return SIGNALLED + (stop.received or StopOnSignal.SIGNALS[0])
-        except ResumeError as error:
+        except (ResumeError, FileFormatError) as error:
             print(f"error: {error}", file=sys.stderr)
             return BAD_INPUT
         except NonFiniteError as error:
@@ -612,8 +644,8 @@ def resume_run(args: argparse.Namespace, extra_callbacks: Sequence[BaseCallback]
             begun, folder = as_begun(args, given)
             stack.enter_context(folder.locked())
             changed = folder.versions_changed()
-            latest_checkpoint(folder.path)  # sets aside what is damaged
-            training = build(begun, folder)
+            then = Opponents.of(latest_checkpoint(folder.path))  # which sets aside what is damaged
+            training = build(begun, folder, then)
         except REFUSALS as error:
             print(f"error: {error}", file=sys.stderr)
             return BAD_INPUT

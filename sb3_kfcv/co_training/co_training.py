@@ -19,20 +19,29 @@ from torch import nn
 from sb3_kfcv.algorithms import ALGOS
 from sb3_kfcv.co_training.opponents import CoLearner, Pool
 from sb3_kfcv.co_training.team_buffers import TeamBuffers
-from sb3_kfcv.common.checks import require_count, require_finite_columns, require_parameters
+from sb3_kfcv.common.checks import require_between, require_count, require_finite_columns, require_parameters
 from sb3_kfcv.common.joint_algorithm import JointAlgorithm
 from sb3_kfcv.common.memory import free_memory, in_words
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.maddpg import MADDPG, MlpPolicy
 from sb3_kfcv.maddpg.policies import MADDPGPolicy
 from sb3_kfcv.replay import JointReplayBuffer
-from sb3_kfcv.saving.attributes import check_attributes
-from sb3_kfcv.saving.values import UnwritableError
+from sb3_kfcv.saving.attributes import check_attributes, require_own
+from sb3_kfcv.saving.values import UnwritableError, check_writable
+from sb3_kfcv.teams.players import require_players
 from sb3_kfcv.teams.team_policy import LineUp, TeamPolicy
 from sb3_kfcv.vec_env.make import layout_of, wins_of
 
 # Settings of a learner that belong to the whole.
 OF_THE_WHOLE = ("policy", "env", "team", "opponents", "stats_window_size", "tensorboard_log", "verbose", "seed", "device")
+
+EXAMPLE = {"wolf": "kfcv_maddpg", "sheep": "maddpg"}  # of teams
+
+# Of a learner's attributes, those that its networks and its buffer are made of: no file can change them in a model.
+BUILT_OF = (
+    *("layout", "observation_space", "action_space", "team", "critic_input", "stores_state", "share_parameters"),
+    *("policy_class", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs", "buffer_size"),
+)
 
 # Of a learner's attributes, those that come from the whole, or of other sections of its file.
 NOT_OF_A_TEAM = ("opponents", "_last_obs", "_last_original_obs", "_last_episode_starts", "ep_info_buffer", "ep_success_buffer")
@@ -117,6 +126,7 @@ class CoTraining(JointAlgorithm):
             supported_action_spaces=(spaces.Box, spaces.MultiDiscrete),
             support_multi_env=True,
         )
+        require_players(teams or {}, EXAMPLE)
         self.teams = {team: _settings_of(given) for team, given in (teams or {}).items()}
         self.opponents = opponents
         self.pool_share = pool_share
@@ -130,6 +140,7 @@ class CoTraining(JointAlgorithm):
             self._setup_model()
 
     def _setup_model(self) -> None:
+        check_writable({name: getattr(self, name) for name in self.checked_settings})
         self.check_settings()
         self.set_random_seed(self.seed)
         self._players = {team: CoLearner() for team in self.teams}
@@ -160,10 +171,10 @@ class CoTraining(JointAlgorithm):
         :raises ValueError: one sentence that says what is wrong
         """
         if not self.teams:
-            raise ValueError('co-training needs teams, such as teams={"wolf": "kfcv_maddpg", "sheep": "maddpg"}')
+            raise ValueError(f"co-training needs teams, such as teams={EXAMPLE}")
         for team, settings in self.teams.items():
             self.layout.members(team)
-            algo = settings["algo"]
+            algo = _settings_of(settings)["algo"]
             if isinstance(algo, str) and algo not in ALGOS:
                 raise ValueError(unknown_name(f"algorithm of {team!r}", algo, ALGOS))
             taken = [name for name in OF_THE_WHOLE if name in settings]
@@ -175,10 +186,12 @@ class CoTraining(JointAlgorithm):
         if len(set(frequencies.values())) > 1:
             raise ValueError(f"train_freq must be the same for all teams, got {frequencies}; gradient_steps may differ")
         left = [group for group in self.layout.group_names if group not in self.teams]
+        require_players(self.opponents or {}, dict.fromkeys(left, "random"))
         given = list(self.opponents or {})
         if set(given) != set(left):
             raise ValueError(f"opponents were given for {given}; the groups that no team learns are {left}")
         require_count("pool_freq", self.pool_freq)
+        require_between("pool_share", self.pool_share, 0, 1)
         by_wins = self.pool_share > 0 and self.pool_sampling == "win_rate"
         if by_wins and self.env is not None and (len(self.teams) != 2 or not wins_of(self.env)):
             raise ValueError('pool_sampling="win_rate" needs two teams and a world that says who wins (an attribute wins)')
@@ -209,8 +222,16 @@ class CoTraining(JointAlgorithm):
 
     # ---- SB3's loop
 
+    def set_env(self, env: Any, force_reset: bool = True) -> None:
+        """As of every model, see :meth:`JointAlgorithm.set_env`."""
+        super().set_env(env, force_reset)
+        self._wins = wins_of(self.get_env())  # type: ignore[arg-type]
+
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         for learner in self.learners.values():
+            noise = learner.action_noise
+            if isinstance(noise, VectorizedActionNoise) and noise.n_envs != self.n_envs:  # of a file
+                learner.action_noise = noise.base_noise
             if learner.action_noise is not None:
                 if self.n_envs > 1 and not isinstance(learner.action_noise, VectorizedActionNoise):
                     learner.action_noise = VectorizedActionNoise(learner.action_noise, self.n_envs)
@@ -369,7 +390,12 @@ class CoTraining(JointAlgorithm):
             if attributes.pop("algorithm") != type(learner).__name__:
                 raise ValueError(f"{team} was learnt by {teams[team]['algorithm']}; this model has {type(learner).__name__}")
             check_attributes(attributes, type(learner))
-            vars(learner).update({name: value for name, value in attributes.items() if name not in ("layout", "n_envs")})
+            require_own(attributes, learner)
+            for name in BUILT_OF:
+                if attributes.get(name) != getattr(learner, name):
+                    raise ValueError(f"{name} of {team} is {attributes.get(name)}; this model has {getattr(learner, name)}")
+            vars(learner).update({name: value for name, value in attributes.items() if name != "n_envs"})
+            learner.check_settings()
 
     def training_state(self) -> dict[str, Any]:
         return {
@@ -388,6 +414,12 @@ class CoTraining(JointAlgorithm):
         for policy, state in zip((self._acting, self._playing), saved["players"], strict=True):
             policy.set_state(state)
         self._line_up, self._next_selves = saved["line_up"], saved["next_selves"]
+
+    def take_opponents(self, then: Mapping[str, Any]) -> None:
+        for policy in (self._acting, self._playing):
+            policy.go_on(then)
+        for learner in self.learners.values():
+            learner.take_opponents(then)
 
     def replay_buffer_state(self) -> dict[str, Any]:
         return self.replay_buffer.state()
@@ -411,6 +443,7 @@ def _settings_of(given: Any) -> dict[str, Any]:
     """
     settings = dict(given) if isinstance(given, Mapping) else {"algo": given}
     algo = settings.get("algo")
+    settings["algo"] = algo = next((name for name, known in ALGOS.items() if known is algo), algo)  # files know it by its name
     if not isinstance(algo, str) and not (isinstance(algo, type) and issubclass(algo, MADDPG)):
         raise ValueError(f"a team learns by an algorithm, such as one of {', '.join(ALGOS)}; got {given!r}")
     return settings

@@ -109,9 +109,14 @@ class Pool(Mixture):
 
         :raises ValueError: if the record is not of these past selves
         """
-        self.offered, self.games, self.won = saved["offered"], saved["games"].copy(), saved["won"].copy()
-        if not len(saved["past"]) == len(self.games) == len(self.won):
-            raise ValueError(f"a pool of {len(saved['past'])} past selves with records of {len(self.games)}")
+        past, games, won = saved["past"], saved["games"].copy(), saved["won"].copy()
+        now = self.players[0].policy
+        if not all(isinstance(one, ActorPolicy) and (one.layout, one.agents) == (now.layout, now.agents) for one in past):
+            raise ValueError("the past selves of a pool are actors of the team itself")
+        if not (games.shape == won.shape == (len(past),) and (won >= 0).all() and (won <= games).all()):
+            raise ValueError(f"a pool of {len(past)} past selves that has played {games} and won {won}")
+        require_count("the past selves that a pool was offered", saved["offered"], least=len(past))
+        self.offered, self.games, self.won = saved["offered"], games, won
         self.rng.bit_generator.state = saved["rng"]
         self.players = [self.players[0], *saved["past"]]
         self._weigh()

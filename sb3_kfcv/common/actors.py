@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -251,13 +251,9 @@ class ActorPolicy(BasePolicy):
     @staticmethod
     def of(policy: ActorPolicy) -> ActorPolicy:
         """A policy's actors as they are now, alone: a copy that no training moves."""
-        alone = ActorPolicy(
-            policy.observation_space, policy.action_space, policy.layout, policy.agents, **policy._actor_parameters
-        )
-        alone.actor.load_state_dict(policy.actor.state_dict())
-        alone.actor.requires_grad_(False)
-        alone.set_training_mode(False)
-        return alone.to(policy.device)
+        fields = _fields(policy)
+        parameters = fields.pop("parameters")
+        return _frozen(_without_drawing(fields), parameters).to(policy.device)
 
     def learning_networks(self) -> list[Any]:
         """Those that a training mode is for; targets have none."""
@@ -407,8 +403,19 @@ def make_player(parameters: dict[str, th.Tensor], **fields: Any) -> ActorPolicy:
     if type(parameters) is not dict or not all(isinstance(tensor, th.Tensor) for tensor in parameters.values()):
         raise ValueError("the parameters of a player are tensors by name")
     with at_most(sum(tensor.numel() for tensor in parameters.values())):
-        policy = ActorPolicy(**fields)
+        policy = _without_drawing(fields)
     check_network(policy.actor, parameters, "parameters")
+    return _frozen(policy, parameters)
+
+
+def _without_drawing(fields: dict[str, Any]) -> ActorPolicy:
+    """Actors whose first parameters are of no use: the program's random generator, which a training goes on with, stays."""
+    with th.random.fork_rng(devices=[]):
+        return ActorPolicy(**fields)
+
+
+def _frozen(policy: ActorPolicy, parameters: Mapping[str, th.Tensor]) -> ActorPolicy:
+    """The policy with these parameters, which no training moves."""
     policy.actor.load_state_dict(parameters)
     policy.actor.requires_grad_(False)
     policy.set_training_mode(False)

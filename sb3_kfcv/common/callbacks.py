@@ -18,6 +18,7 @@ from sb3_kfcv.common.actors import ActorPolicy
 from sb3_kfcv.common.evaluation import evaluate, with_interval
 from sb3_kfcv.common.patient_logs import patience
 from sb3_kfcv.saving.files import atomic_write, going_on
+from sb3_kfcv.saving.values import UnwritableError
 from sb3_kfcv.teams.players import JointModel
 from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import layout_of
@@ -136,15 +137,25 @@ class MultiAgentEvalCallback(EventCallback):
         return {name: np.stack([episodes[name] for episodes in self.evaluations]) for name in names}
 
     def get_state(self) -> dict[str, Any]:
-        """All results so far, and when the next evaluation is due."""
-        drawing = {} if self.yardstick is None else {"yardstick": self.yardstick.get_state()}
-        return {**{name: getattr(self, name) for name in self.KEPT}, "evaluations": self._stacked(), **drawing}
+        """All results so far, when the next evaluation is due, and the players of a yardstick."""
+        kept = {name: getattr(self, name) for name in (*self.KEPT, "name")}
+        return {**kept, "evaluations": self._stacked(), **self._yardstick_state()}
+
+    def _yardstick_state(self) -> dict[str, Any]:
+        if self.yardstick is None:
+            return {}
+        try:
+            players = self.yardstick.written(self.yardstick.players)
+        except UnwritableError:  # found again where the training is resumed
+            players = {}
+        return {"yardstick": self.yardstick.get_state(), "players": players}
 
     def set_state(self, saved: dict[str, Any]) -> None:
         """Inverse of :meth:`get_state`."""
         for name in self.KEPT:
             setattr(self, name, saved[name])
         if self.yardstick is not None:
+            self.yardstick.go_on(saved["players"])
             self.yardstick.set_state(saved["yardstick"])
         by_name = saved["evaluations"]
         self.evaluations = [{name: values[i] for name, values in by_name.items()} for i in range(len(self.timesteps))]

@@ -3,7 +3,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -272,6 +272,8 @@ class MADDPG(JointAlgorithm):
     def _make_opponent_policy(self) -> TeamPolicy | None:
         others = [group for group in self.layout.group_names if self.team and group != self.team]
         if not others:
+            if self.opponents:
+                raise ValueError(f"opponents were given, but team={self.team!r} is everybody in this world")
             return None
         if not self.opponents:
             example = {group: "random" for group in others}
@@ -534,6 +536,10 @@ class MADDPG(JointAlgorithm):
             except UnwritableError:
                 del attributes["opponents"]
         return attributes
+
+    def take_opponents(self, then: Mapping[str, Any]) -> None:
+        if self._opponent_policy is not None:
+            self._opponent_policy.go_on(then)
 
     def _excluded_save_params(self) -> list[str]:
         excluded = [

@@ -63,6 +63,18 @@ def check_attributes(attributes: dict[str, Any], algorithm: type) -> None:
         _check_episodes(name, deque() if attributes.get(name) is None else attributes[name])
 
 
+def require_own(attributes: dict[str, Any], model: Any) -> None:
+    """
+    :param attributes: that a model which is set up is to take over
+    :param model: the model
+    :raises ValueError: names one that the model makes itself, such as its networks
+    """
+    networks = {name.split(".")[0] for name in model._get_torch_save_params()[0]}
+    for name in attributes:
+        if name in networks or name in model._excluded_save_params():
+            raise ValueError(f"{name} is made by the model itself, no file gives it")
+
+
 def without_retired(attributes: dict[str, Any]) -> dict[str, Any]:
     """
     :param attributes: of a model, from a file
@@ -113,6 +125,8 @@ def _check_classes(attributes: dict[str, Any]) -> None:
 def _check_opponents(opponents: Any) -> None:
     """Names of scripted policies, or what was made of the file itself: it has no say about other files."""
     for player in (opponents or {}).values():
+        if isinstance(player, list | tuple | dict):
+            raise ValueError(f"an opponent is {player!r}; a mixture is no plain list or map in a file")
         if isinstance(player, str) and is_path(player):
             raise ValueError(f"an opponent is the file {player!r}, which is nothing that a file can say")
 

@@ -23,7 +23,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.saving.archive import Archive, FileFormatError, open_archive, write_archive
-from sb3_kfcv.saving.attributes import check_attributes, without_retired
+from sb3_kfcv.saving.attributes import check_attributes, require_own, without_retired
 from sb3_kfcv.saving.files import going_on
 from sb3_kfcv.saving.run_state import (
     UnreadableEnvError,
@@ -364,10 +364,12 @@ class Checkpoints(BaseCallback):
         self._check_settings(checkpoint)
         model, attributes = self.model, dict(checkpoint.attributes)
         attributes.setdefault("action_noise", None)
-        for name in ("algorithm", "verbose", "tensorboard_log", "opponents", "_total_timesteps"):
-            attributes.pop(name, None)
         with refusals(checkpoint, "attributes"):
             check_attributes(attributes, type(model))
+            require_own(attributes, model)
+        self._take_opponents(checkpoint)
+        for name in ("algorithm", "verbose", "tensorboard_log", "opponents", "_total_timesteps"):
+            attributes.pop(name, None)
         with refusals(checkpoint, "parameters"):
             model.set_parameters(model.checked_parameters(checkpoint.parameters))
         with refusals(checkpoint, "replay_buffer"):
@@ -378,6 +380,12 @@ class Checkpoints(BaseCallback):
             model.take_sections(checkpoint.further)
         self._pieces = self._pieces_of[checkpoint.path] = checkpoint.pieces
         self.last_path = checkpoint.path
+
+    def _take_opponents(self, checkpoint: Checkpoint) -> None:
+        try:
+            self.model.take_opponents(checkpoint.attributes.get("opponents") or {})
+        except ValueError as error:
+            raise ResumeError(f"{checkpoint.path} is of a training against others: {error}") from None
 
     def _check_settings(self, checkpoint: Checkpoint) -> None:
         model, saved = self.model, checkpoint.attributes

@@ -112,6 +112,14 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
     def set_training_state(self, saved: dict[str, Any]) -> None:
         """Inverse of :meth:`training_state`."""
 
+    def take_opponents(self, then: Mapping[str, Any]) -> None:
+        """
+        Go on against those that a training was against, whatever their files hold by now.
+
+        :param then: the players as a checkpoint holds them, by the group that they play
+        :raises ValueError: if others are to play here
+        """
+
     def take_sections(self, sections: Mapping[str, Any]) -> None:
         """
         Take over what an algorithm's file has beside attributes, parameters and what every kind of file has.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -69,7 +70,7 @@ class Mixture:
 
     def __init__(self, players: Sequence[Any], weights: Sequence[float] | np.ndarray | None = None) -> None:
         self.players = list(players)
-        self.weights = np.array([1.0] * len(self.players) if weights is None else weights, dtype=float)
+        self.weights = _weights([1.0] * len(self.players) if weights is None else weights)
         if not self.players or self.weights.shape != (len(self.players),):
             raise ValueError(f"a mixture needs players, and a weight for each; got {len(self.players)} and {self.weights}")
         if not (np.isfinite(self.weights).all() and (self.weights >= 0).all() and self.weights.any()):
@@ -90,6 +91,18 @@ class Mixture:
         :param playing: who played (episodes,)
         :param won: how far they won, in [0, 1] (episodes,)
         """
+
+
+def _weights(given: Sequence[float] | np.ndarray) -> np.ndarray:
+    """
+    :raises ValueError: for what is no sequence of numbers
+    """
+    if isinstance(given, np.ndarray) and given.dtype.kind in "iuf":
+        return given.astype(float)
+    listed = given if isinstance(given, str) else list(given)
+    if isinstance(listed, str) or not all(isinstance(one, Real) and not isinstance(one, bool) for one in listed):
+        raise ValueError(f"the weights of a mixture must be numbers, got {listed!r}")
+    return np.array(listed, dtype=float)
 
 
 def _make_mixture(players: list[Any], weights: np.ndarray) -> Mixture:
@@ -145,15 +158,16 @@ def find_player(
         return _scripted(given, layout, group, rng, action_space, **facts)
     else:
         player, name = given, f"the player of {group!r}"
-        if not isinstance(player, ScriptedPolicy) and not callable(getattr(player, "predict", None)):
+        plays = isinstance(player, ScriptedPolicy) or callable(getattr(player, "predict", None))
+        if isinstance(player, type) or not plays:
             raise ValueError(f"{group!r} cannot be played by {given!r}; give a name, a path, a model or a scripted policy")
     theirs = getattr(player, "layout", layout)
     if theirs != layout:
         raise ValueError(f"{name} is for another world: {_described(theirs)}; this one has {_described(layout)}")
     agents = player.agents if hasattr(player, "layout") and hasattr(player, "agents") else range(layout.n_agents)
     if not set(layout.members(group)) <= set(agents):
-        plays = ", ".join(dict.fromkeys(layout.groups[i] for i in agents))
-        raise ValueError(f"{name} plays {plays}; wanted is a player of {group}")
+        groups = ", ".join(dict.fromkeys(layout.groups[i] for i in agents))
+        raise ValueError(f"{name} plays {groups}; wanted is a player of {group}")
     return player
 
 
@@ -212,7 +226,7 @@ def load_player(path: str | os.PathLike[str], group: str | None = None) -> Actor
     """
     file: Path = existing(Path(path))
     if not file.is_file():
-        raise ValueError(f"there is no file {file} to take a player of")
+        raise ValueError(f"there is no file {path} to take a player of")
     with open_archive(file, *PLAYER_KINDS) as archive:
         if archive.kind == "player":
             return player_in(archive)
@@ -243,6 +257,16 @@ def _actors_of(attributes: Mapping[str, Any], parameters: Mapping[str, Any]) -> 
     )
 
 
+def require_players(players: Any, example: Mapping[str, Any]) -> None:
+    """
+    :param players: must be a map of groups to their players
+    :param example: of such a map
+    :raises ValueError: if it is something else
+    """
+    if not isinstance(players, Mapping):
+        raise ValueError(f"players are given by their group, such as {dict(example)}; got {players!r}")
+
+
 def written(player: Any) -> Any:
     """
     A player as a file can hold it: a scripted policy by its name, a model by its actors as they are now.
@@ -263,3 +287,32 @@ def written(player: Any) -> Any:
     if isinstance(policy, ActorPolicy):
         return ActorPolicy.of(policy)
     raise UnwritableError(f"a player of type {type(player).__qualname__} cannot be saved")
+
+
+def going_on(group: str, here: Any, then: Any) -> Any:
+    """
+    Who goes on playing where a training is resumed: an actor from a file as it was then, since the file may hold another one
+    by now; all others as they are here.
+
+    :param group: whom they play
+    :param here: the player as it was found here
+    :param then: what :func:`written` gave of it then
+    :raises ValueError: if somebody else played then
+    """
+    if isinstance(here, Mixture) and isinstance(then, Mixture) and np.array_equal(here.weights, then.weights):
+        return Mixture([going_on(group, *pair) for pair in zip(here.players, then.players, strict=True)], here.weights)
+    now = written(here)
+    if isinstance(now, ActorPolicy) and isinstance(then, ActorPolicy):
+        if (now.layout, now.agents) != (then.layout, then.agents):
+            raise ValueError(f"{group} was played by actors of another world or of other agents")
+        return then.to(here.device) if type(here) is ActorPolicy else here
+    if type(now) is not type(then) or now != then:
+        raise ValueError(f"{group} was played by {_in_words(then)}; here it is played by {_in_words(now)}")
+    return here
+
+
+def _in_words(player: Any) -> str:
+    if isinstance(player, Mixture):
+        weights = ", ".join(f"{weight:g}" for weight in player.weights)
+        return f"a mixture of {', '.join(map(_in_words, player.players))} (weights {weights})"
+    return "a model" if isinstance(player, ActorPolicy) else str(player)

@@ -12,7 +12,7 @@ from gymnasium import spaces
 from sb3_kfcv.common.actors import ActorPolicy
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.envs.scripted import ScriptedPolicy
-from sb3_kfcv.teams.players import Mixture, Player, find_player, written
+from sb3_kfcv.teams.players import Mixture, Player, find_player, going_on, require_players, written
 
 # Who of each mixture plays in each row (rows,), mixture after mixture.
 LineUp = tuple[np.ndarray, ...]
@@ -45,6 +45,7 @@ class TeamPolicy:
         **facts: Any,
     ) -> None:
         wanted = layout.group_names if groups is None else tuple(groups)
+        require_players(players, dict.fromkeys(wanted, "random"))
         if set(players) != set(wanted):
             raise ValueError(f"players were given for {sorted(players)}; to be played are {sorted(wanted)}")
         self.layout = layout
@@ -54,7 +55,10 @@ class TeamPolicy:
         }
         self.columns = {group: self._action_columns(group) for group in wanted}
         self._critic_columns = {group: _columns(layout, group) for group in wanted}
-        self._mixtures = {group: player for group, player in self.players.items() if isinstance(player, Mixture)}
+
+    @property
+    def _mixtures(self) -> dict[str, Mixture]:
+        return {group: player for group, player in self.players.items() if isinstance(player, Mixture)}
 
     def predict(
         self,
@@ -175,17 +179,36 @@ class TeamPolicy:
         """
         return {group: written(self.players[group]) for group in groups}
 
+    def go_on(self, then: Mapping[str, Any]) -> None:
+        """
+        Let those play that have played where a training is resumed, see :func:`~sb3_kfcv.teams.players.going_on`.
+
+        :param then: what :meth:`written` gave
+        :raises ValueError: if others played then
+        """
+        for group, player in then.items():
+            if group in self.players:
+                self.players[group] = going_on(group, self.players[group], player)
+
     def get_state(self) -> dict[str, Any]:
-        """The random generators of the players, by group; and under ``""`` that of the mixtures."""
-        drawing = {group: player for group, player in self.players.items() if hasattr(player, "rng")}
-        own = {"": self.rng.bit_generator.state} if self._mixtures else {}
-        return {**own, **{group: player.rng.bit_generator.state for group, player in drawing.items()}}
+        """The random generators of all that draw, by their places."""
+        return {place: owner.rng.bit_generator.state for place, owner in self._drawing().items()}
 
     def set_state(self, saved: dict[str, Any]) -> None:
         """Inverse of :meth:`get_state`."""
-        for group, state in saved.items():
-            owner: Any = self.players[group] if group else self
-            owner.rng.bit_generator.state = state
+        drawing = self._drawing()
+        for place, state in saved.items():
+            drawing[place].rng.bit_generator.state = state
+
+    def _drawing(self) -> dict[str, Any]:
+        """What draws: players by their group, ``""`` of the mixtures, and whoever brought a generator into one of them."""
+        found: dict[str, Any] = {"": self} if self._mixtures else {}
+        found.update({group: player for group, player in self.players.items() if hasattr(player, "rng")})
+        for group, mixture in self._mixtures.items():
+            for i, player in enumerate(mixture.players):
+                if getattr(player, "rng", self.rng) is not self.rng:
+                    found[f"{group}/{i}"] = player
+        return found
 
     def _actions(self, player: Any, columns: np.ndarray, rows: np.ndarray, deterministic: bool) -> np.ndarray:
         """What one player does: (B, columns)."""
