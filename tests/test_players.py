@@ -14,6 +14,7 @@ from sb3_kfcv import MADDPG, PERMADDPG, CoTraining, FileFormatError, make_vec_en
 from sb3_kfcv.common.actors import ActorPolicy
 from sb3_kfcv.common.callbacks import MultiAgentEvalCallback, SavePlayers
 from sb3_kfcv.common.evaluation import evaluate
+from sb3_kfcv.envs import grassland_v0
 from sb3_kfcv.saving.checkpoints import Checkpoints
 from sb3_kfcv.teams.players import Mixture, find_player, load_player, written
 from sb3_kfcv.teams.team_policy import TeamPolicy
@@ -451,3 +452,14 @@ def test_teams_of_mpe2(world, continuous, tmp_path):
     np.testing.assert_array_equal(*(one.predict(rows, deterministic=True)[0] for one in (both, loaded)))
     assert np.isfinite(evaluate_policy(loaded, env(), 2)[0])
     assert loaded.learn(40).num_timesteps == 40
+
+
+@pytest.mark.parametrize(
+    "maker", [lambda **kwargs: make_vec_env("Grassland-v0", 2, env_kwargs=kwargs), grassland_v0.parallel_env]
+)
+def test_scripted_opponents_know_of_the_obstacles(maker):
+    """Obstacles end the observation: who does not know of them takes them for grass, and everybody for somebody else."""
+    model = MADDPG(
+        "MlpPolicy", maker(n_wolves=2, n_sheep=1, n_grass=1, n_obstacles=3), team="wolf", opponents={"sheep": "graze"}
+    )
+    assert model._opponent_policy.players["sheep"].grass(np.zeros((1, 1, model.layout.obs_sizes[2]))).shape == (1, 1, 1, 2)

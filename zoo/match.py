@@ -14,7 +14,7 @@ import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import e
 
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.naming import unknown_name
-from sb3_kfcv.envs.scripted import WorldFacts
 from sb3_kfcv.matches import Arena, PayOffTable, Side, curve, pay_off_table
 from sb3_kfcv.matches.pay_off import interval_of, shares_of
 from sb3_kfcv.saving.archive import library_versions
@@ -209,8 +208,7 @@ def build(args: argparse.Namespace) -> Matches:
     th.set_num_threads(args.num_threads)
     env_kwargs = check_env_kwargs(args.env, parse_pairs("--env-kwargs", args.env_kwargs))
     env = make_vec_env(args.env, min(args.n_envs, args.n_episodes), env_kwargs=env_kwargs)
-    facts = {field.name: env_kwargs[field.name] for field in fields(WorldFacts) if field.name in env_kwargs}
-    arena = Arena(env, **facts)
+    arena = Arena(env)
     known = arena.layout.group_names
     if len(known) < 2:
         raise ValueError(f"{args.env} has one group, {known[0]}; a match is between two")

@@ -37,7 +37,7 @@ from sb3_kfcv.saving.checkpoints import Checkpoint, Checkpoints, ResumeError, ch
 from sb3_kfcv.saving.normalization import load_normalization
 from sb3_kfcv.saving.saveable import refusals
 from sb3_kfcv.teams.team_policy import TeamPolicy
-from sb3_kfcv.vec_env.make import layout_of, make_vec_env, metric_names_of
+from sb3_kfcv.vec_env.make import facts_of, layout_of, make_vec_env, metric_names_of
 from sb3_kfcv.vec_env.named_wrappers import find_wrappers
 from zoo.hyperparams import (
     CO_TRAINING,
@@ -381,7 +381,8 @@ def make_yardsticks(
     found = yardsticks(args.yardstick, layout, learners, args.algo == CO_TRAINING, then)
     for team, _, opponents in found:
         others = [group for group in layout.group_names if group != team]
-        TeamPolicy(layout, opponents, groups=others, action_space=eval_env.action_space)  # refuses who cannot play
+        facts = facts_of(eval_env)
+        TeamPolicy(layout, opponents, None, others, eval_env.action_space, **facts)  # refuses who cannot play
     return found
 
 

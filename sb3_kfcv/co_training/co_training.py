@@ -30,7 +30,7 @@ from sb3_kfcv.saving.attributes import check_attributes, require_own
 from sb3_kfcv.saving.values import UnwritableError, check_writable
 from sb3_kfcv.teams.players import require_players
 from sb3_kfcv.teams.team_policy import LineUp, TeamPolicy
-from sb3_kfcv.vec_env.make import layout_of, wins_of
+from sb3_kfcv.vec_env.make import facts_of, layout_of, wins_of
 
 # Settings of a learner that belong to the whole.
 OF_THE_WHOLE = ("policy", "env", "team", "opponents", "stats_window_size", "tensorboard_log", "verbose", "seed", "device")
@@ -134,6 +134,7 @@ class CoTraining(JointAlgorithm):
         self.pool_size = pool_size
         self.pool_sampling = pool_sampling
         self._episode_metrics: deque[dict[str, float]] = deque(maxlen=stats_window_size)
+        self.world_facts: dict[str, float] = {} if self.env is None else facts_of(self.env)  # for scripted opponents
         if self.env is not None:
             self.layout = layout_of(self.env)
         if _init_setup_model:
@@ -213,7 +214,7 @@ class CoTraining(JointAlgorithm):
             _init_setup_model=False,
             **settings,
         )
-        learner.layout, learner.n_envs = self.layout, self.n_envs
+        learner.layout, learner.n_envs, learner.world_facts = self.layout, self.n_envs, self.world_facts
         learner.observation_space, learner.action_space = self.observation_space, self.action_space
         learner.stores_state = any(own.get("critic_input", "observations") != "observations" for own in self.teams.values())
         learner._setup_model()
@@ -355,7 +356,8 @@ class CoTraining(JointAlgorithm):
 
     def _team_policy(self, players: Mapping[str, Any]) -> TeamPolicy:
         everyone = {**players, **(self.opponents or {})}
-        return TeamPolicy(self.layout, everyone, np.random.default_rng(self.seed), action_space=self.action_space)
+        rng = np.random.default_rng(self.seed)
+        return TeamPolicy(self.layout, everyone, rng, None, self.action_space, **self.world_facts)
 
     # ---- files
 

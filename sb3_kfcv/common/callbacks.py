@@ -21,7 +21,7 @@ from sb3_kfcv.saving.files import atomic_write, going_on
 from sb3_kfcv.saving.values import UnwritableError
 from sb3_kfcv.teams.players import JointModel
 from sb3_kfcv.teams.team_policy import TeamPolicy
-from sb3_kfcv.vec_env.make import layout_of
+from sb3_kfcv.vec_env.make import facts_of, layout_of
 
 
 class MultiAgentEvalCallback(EventCallback):
@@ -86,7 +86,7 @@ class MultiAgentEvalCallback(EventCallback):
         layout = layout_of(eval_env)
         layout.members(str(self.team))
         others = [group for group in layout.group_names if group != self.team]
-        return TeamPolicy(layout, opponents, np.random.default_rng(0), others, eval_env.action_space)
+        return TeamPolicy(layout, opponents, np.random.default_rng(0), others, eval_env.action_space, **facts_of(eval_env))
 
     def _on_training_start(self) -> None:
         self._next = _next_multiple(self.eval_freq, self.num_timesteps)

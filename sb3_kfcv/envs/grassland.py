@@ -144,6 +144,10 @@ class GrasslandWorlds(ParticleWorlds):
         self.obstacles = self._own.obstacles
 
     @property
+    def facts(self) -> dict[str, float]:
+        return {"n_obstacles": self.obstacles.shape[1]}
+
+    @property
     def _own(self) -> GrasslandArrays:
         return self._arrays_of_grassland
 

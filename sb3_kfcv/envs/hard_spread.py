@@ -134,6 +134,10 @@ class HardSpreadWorlds(ParticleWorlds):
         self.inner_walls = self._own.inner_walls
 
     @property
+    def facts(self) -> dict[str, float]:
+        return {"wall_width": self.wall_width, "door": self.door}
+
+    @property
     def _own(self) -> HardSpreadArrays:
         return self._arrays_of_hard_spread
 

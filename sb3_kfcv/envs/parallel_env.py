@@ -43,6 +43,7 @@ class ParticleParallelEnv(ParallelEnv):
         self.metric_names = worlds.metric_names
         self.scalar_reward = worlds.scalar_reward
         self.wins = worlds.wins
+        self.facts = worlds.facts
         self.possible_agents = list(worlds.agents)
         self._index = {agent: i for i, agent in enumerate(worlds.agents)}
         ends = np.cumsum(worlds.obs_sizes).tolist()

@@ -62,6 +62,11 @@ class ParticleWorlds(ABC):
     """Which group can win, and the metric in [0, 1] that tells how far; of two groups, the other one wins the rest."""
     render_fps = round(1 / physics.DT)
 
+    @property
+    def facts(self) -> dict[str, float]:
+        """What scripted policies must know beyond their observations, see :class:`~sb3_kfcv.envs.scripted.WorldFacts`."""
+        return {}
+
     def __init__(
         self,
         n_worlds: int,

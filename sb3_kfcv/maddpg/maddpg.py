@@ -38,7 +38,7 @@ from sb3_kfcv.replay import JointReplayBuffer, JointReplayBufferSamples
 from sb3_kfcv.saving.attributes import RETIRED_SETTINGS
 from sb3_kfcv.saving.values import UnwritableError
 from sb3_kfcv.teams.team_policy import LineUp, TeamPolicy
-from sb3_kfcv.vec_env.make import layout_of
+from sb3_kfcv.vec_env.make import facts_of, layout_of
 
 
 class MADDPG(JointAlgorithm):
@@ -177,6 +177,7 @@ class MADDPG(JointAlgorithm):
         self.actor_regularization = actor_regularization
         self.gumbel_temperature = gumbel_temperature
         self._episode_metrics: deque[dict[str, float]] = deque(maxlen=stats_window_size)
+        self.world_facts: dict[str, float] = {} if self.env is None else facts_of(self.env)  # for scripted opponents
         if self.env is not None:
             self.layout = layout_of(self.env)
 
@@ -278,9 +279,8 @@ class MADDPG(JointAlgorithm):
         if not self.opponents:
             example = {group: "random" for group in others}
             raise ValueError(f"team={self.team!r} needs players for the other groups, such as opponents={example}")
-        return TeamPolicy(
-            self.layout, self.opponents, np.random.default_rng(self.seed), groups=others, action_space=self.action_space
-        )
+        rng = np.random.default_rng(self.seed)
+        return TeamPolicy(self.layout, self.opponents, rng, others, self.action_space, **self.world_facts)
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor

@@ -29,7 +29,7 @@ from sb3_kfcv.saving.archive import open_archive
 from sb3_kfcv.saving.files import existing, is_path
 from sb3_kfcv.teams.players import PLAYER_KINDS, Mixture, RandomPlayer, find_player
 from sb3_kfcv.teams.team_policy import TeamPolicy
-from sb3_kfcv.vec_env.make import layout_of, metric_names_of, wins_of
+from sb3_kfcv.vec_env.make import facts_of, layout_of, metric_names_of, wins_of
 
 BLOCK = 32
 """Rows that a player sees at once."""
@@ -182,11 +182,11 @@ class Arena:
     ``predict`` gives the same for the same block of rows.
 
     :param env: vec env of joint worlds; an episode must be determined by the seed of its reset
-    :param facts: for scripted policies, see :class:`~sb3_kfcv.envs.scripted.WorldFacts`
+    :param facts: for scripted policies, see :class:`~sb3_kfcv.envs.scripted.WorldFacts`; by default what the world says
     """
 
     def __init__(self, env: VecEnv, **facts: Any) -> None:
-        self.env, self.facts = env, facts
+        self.env, self.facts = env, {**facts_of(env), **facts}
         self.layout = layout_of(env)
         self.wins = wins_of(env)
 

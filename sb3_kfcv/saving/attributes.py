@@ -49,6 +49,7 @@ def check_attributes(attributes: dict[str, Any], algorithm: type) -> None:
     check_spaces(attributes["layout"], attributes["observation_space"], attributes["action_space"])
     _check_classes(attributes)
     _check_opponents(attributes.get("opponents"))
+    _check_facts(attributes.get("world_facts", {}))
     _check_noise(attributes.get("action_noise"), attributes["action_space"].shape)
     require_count("n_envs", attributes["n_envs"])
     for name in COUNTERS:
@@ -129,6 +130,11 @@ def _check_opponents(opponents: Any) -> None:
             raise ValueError(f"an opponent is {player!r}; a mixture is no plain list or map in a file")
         if isinstance(player, str) and is_path(player):
             raise ValueError(f"an opponent is the file {player!r}, which is nothing that a file can say")
+
+
+def _check_facts(facts: Any) -> None:
+    if not isinstance(facts, dict) or any(type(fact) not in (int, float) for fact in facts.values()):
+        raise ValueError(f"world_facts must be numbers by name, got {facts!r}")
 
 
 def _check_noise(noise: Any, shape: tuple[int, ...]) -> None:

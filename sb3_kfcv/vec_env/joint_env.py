@@ -74,6 +74,7 @@ class JointEnv(gym.Env):
         self._columns = dict(zip(self.layout.agents, self.layout.obs_slices, strict=True))
         self._places = {name: slice(i, i + 1) for i, name in enumerate(self.layout.agents)}
         self.wins = dict(getattr(env, "wins", {}))
+        self.facts = dict(getattr(env, "facts", {}))
         self._weights = scalar_weights(self.layout, getattr(env, "scalar_reward", "mean") if reward == "default" else reward)
         self._world_metrics = tuple(getattr(env, "metric_names", ()))
         self.metric_names = (*self._world_metrics, *(f"return_{group}" for group in self.layout.group_names))

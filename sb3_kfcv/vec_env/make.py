@@ -223,6 +223,11 @@ def wins_of(env: VecEnv) -> dict[str, str]:
     return dict(env.get_attr("wins", [0])[0]) if env.has_attr("wins") else {}
 
 
+def facts_of(env: VecEnv) -> dict[str, float]:
+    """What scripted policies must know of a world beyond its observations; nothing if it does not say."""
+    return dict(env.get_attr("facts", [0])[0]) if env.has_attr("facts") else {}
+
+
 def metric_names_of(env: VecEnv) -> tuple[str, ...]:
     """Names of the episode metrics of a vec env; none if it declares none."""
     return tuple(env.get_attr("metric_names", [0])[0]) if env.has_attr("metric_names") else ()
