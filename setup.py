@@ -45,6 +45,7 @@ setup(
             "mpe2>=1.0",
         ],
         "contrib": ["sb3-contrib>=2.9"],
+        "zoo3": ["rl_zoo3>=2.9", "requests"],
         "video": ["moviepy>=2.0"],
         "docs": ["mkdocs>=1.6", "mkdocstrings[python]>=0.26"],
     },

@@ -1,18 +1,8 @@
 """Slow and plain versions of what the library does in stacks, and made-up transitions to feed both."""
 
-from itertools import pairwise
-
 import numpy as np
 import torch as th
 from torch import nn
-
-
-def plain_mlp(sizes):
-    """``nn.Linear`` layers with ReLU between them."""
-    layers = []
-    for n_in, n_out in pairwise(sizes):
-        layers += [nn.Linear(n_in, n_out), nn.ReLU()]
-    return nn.Sequential(*layers[:-1])
 
 
 def one_hot_networks(stack):
@@ -23,14 +13,13 @@ def one_hot_networks(stack):
     networks = []
     for net in range(stack.n_networks):
         member = stack.members.tolist().index(net)
-        separate = stack.network(member)
-        plain = plain_mlp([stack.sizes[0] + n_members, *stack.sizes[1:]])
+        plain = stack.network(member)
+        without_number = plain[0]
+        plain[0] = nn.Linear(stack.sizes[0] + n_members, stack.sizes[1])
         with th.no_grad():
-            for ours, theirs in zip(plain[2::2], separate[2::2], strict=True):
-                ours.load_state_dict(theirs.state_dict())
             own_bias = stack.member_bias[:, 0]  # (members, hidden)
-            plain[0].weight.copy_(th.cat([separate[0].weight, own_bias.T], dim=1))
-            plain[0].bias.copy_(separate[0].bias - own_bias[member])
+            plain[0].weight.copy_(th.cat([without_number.weight, own_bias.T], dim=1))
+            plain[0].bias.copy_(without_number.bias - own_bias[member])
         networks.append(plain.to(stack.member_bias.dtype))
     return networks
 

@@ -159,6 +159,7 @@ OF_EVERY_KIND = {
         ActorPolicy.of(
             MADDPG("MlpPolicy", toy(discrete=True), share_parameters=True, policy_kwargs={"activation_fn": nn.Tanh}).policy
         ),
+        ActorPolicy.of(MADDPG("MlpPolicy", toy(), policy_kwargs={"layer_norm": True}).policy),
     ],
     "Mixture": [Mixture(["flee", "graze"], [3, 1]), Mixture([ActorPolicy.of(MADDPG("MlpPolicy", toy()).policy), "random"])],
 }

@@ -218,6 +218,13 @@ VARIANTS = {
         "max_grad_norm": 0.1,
         "policy_kwargs": {"net_arch": [8, 7], "n_critics": 2},
     },
+    "layer norm": {"policy_kwargs": {"net_arch": [8, 7], "layer_norm": True}},
+    "layer norm, twin critics of the own observation, clipped": {
+        "critic_input": "own_observation",
+        "max_grad_norm": 0.05,
+        "policy_kwargs": {"net_arch": [8, 7], "layer_norm": True, "n_critics": 2},
+    },
+    "layer norm, discrete": {"toy": {"discrete": True}, "policy_kwargs": {"net_arch": [8, 7], "layer_norm": True}},
 }
 
 
@@ -235,6 +242,13 @@ def test_updates_equal_the_slow_version(variant):
         th.manual_seed(3)
         model.train(1, BATCH)
         slow.assert_equal_to(model, atol=1e-6)  # networks are taken out of a stack in single precision
+
+
+@pytest.mark.parametrize("critic_input", ["observations", "state", "own_observation"])
+def test_layer_norms_stand_in_actors_critics_and_their_targets(critic_input):
+    model = make_model(critic_input=critic_input, policy_kwargs={"net_arch": [8, 7], "layer_norm": True})
+    for networks in (model.actor, model.actor_target, model.critic, model.critic_target):
+        assert sum(isinstance(layer, nn.LayerNorm) for layer in networks.network(2)) == 2
 
 
 def test_one_update_equals_the_slow_version_to_1e_5():
@@ -260,13 +274,15 @@ def test_importance_weights_scale_the_critic_loss_alone():
     slow.assert_equal_to(model, atol=1e-6)
 
 
+@pytest.mark.parametrize("layer_norm", [False, True], ids=["", "layer norm"])
 @pytest.mark.parametrize("max_grad_norm", [None, 0.05])
-def test_shared_parameters_equal_one_network_per_group_with_one_hot_agents(max_grad_norm):
+def test_shared_parameters_equal_one_network_per_group_with_one_hot_agents(max_grad_norm, layer_norm):
     """
     Two scouts share an actor and a critic, whose loss is the sum of theirs; the tank has its own. The shared critic reads
     the agent itself first: for the second scout the two scouts change places.
     """
-    model = make_model(share_parameters=True, max_grad_norm=max_grad_norm)
+    policy_kwargs = {"net_arch": [8, 7], "layer_norm": layer_norm}
+    model = make_model(share_parameters=True, max_grad_norm=max_grad_norm, policy_kwargs=policy_kwargs)
     (batch,) = draw(model, 1)
     layout = model.layout
     group_of_agent = [0, 0, 1]

@@ -6,12 +6,16 @@ import pathlib
 import numpy as np
 import pytest
 import torch as th
+from crafted import drop, tampered
 from references import assert_equal_trees, parameters_of
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from torch import nn
 from toy_envs import ToyParallelEnv
 
 from sb3_kfcv import KFCVMADDPG, MADDPG, PERMADDPG, JointEnv, make_vec_env
+from sb3_kfcv.common.actors import ActorPolicy
 from sb3_kfcv.envs import grassland_v0, hard_spread_v0
+from sb3_kfcv.teams.players import load_player
 
 CURRICULUM = {"teacher_batch_size": 8, "first_teacher_steps": 3, "teacher_steps": 2, "refresh_every": 5}
 EVERY_ALGO = pytest.mark.parametrize("algo", [MADDPG, PERMADDPG, KFCVMADDPG])
@@ -112,9 +116,10 @@ def test_load_takes_what_the_constructor_takes(build, tmp_path):
     [
         {"critic_input": "state", "share_parameters": True},
         {"policy_kwargs": {"net_arch": [8], "n_critics": 2}, "policy_delay": 2, "max_grad_norm": 0.5},
+        {"policy_kwargs": {"net_arch": {"pi": [8], "qf": [12, 6]}, "layer_norm": True}},
         {"learning_rate": 3e-4, "gamma": 0.9, "tau": 0.5, "reward_scale": 0.1, "train_freq": (2, "step")},
     ],
-    ids=["state, shared", "stabilised", "numbers"],
+    ids=["state, shared", "stabilised", "layer norm", "numbers"],
 )
 def test_settings_come_back(settings, tmp_path):
     model = make(**settings)
@@ -130,6 +135,35 @@ def test_replay_settings_come_back(tmp_path):
     make(KFCVMADDPG, replay_buffer_kwargs={"n_folds": 3, "stage_rule": "anti", "lambda_init": 0.0}).save(tmp_path / "model")
     buffer = KFCVMADDPG.load(tmp_path / "model", env=toy()).replay_buffer
     assert (buffer.n_folds, buffer.stage_rule, buffer.lambda_init) == (3, "anti", 0.0)
+
+
+def taught_with_norms():
+    """A model whose layer norms are no longer what they were at first."""
+    return make(learning_rate=0.1, policy_kwargs={"net_arch": [8], "layer_norm": True}).learn(40)
+
+
+@pytest.mark.parametrize("saved", [lambda model: model, lambda model: ActorPolicy.of(model.policy)], ids=["model", "player"])
+def test_players_carry_their_layer_norms(saved, tmp_path):
+    """Taken out of a model's file, or of a file of the actors alone."""
+    model = taught_with_norms()
+    saved(model).save(tmp_path / "file.zip")
+    player = load_player(tmp_path / "file.zip")
+    assert isinstance(player.actor.network(0)[1], nn.LayerNorm)
+    np.testing.assert_array_equal(model.predict(ROWS, deterministic=True)[0], player.predict(ROWS, deterministic=True)[0])
+    np.testing.assert_array_equal(model.predict_agent("tank_0", ROWS[:, 6:]), player.predict_agent("tank_0", ROWS[:, 6:]))
+
+
+def test_a_policy_alone_carries_its_layer_norms(tmp_path):
+    model = taught_with_norms()
+    model.policy.save(tmp_path / "policy.zip")
+    loaded = type(model.policy).load(tmp_path / "policy.zip")
+    assert_same_parameters(parameters_of(model), loaded.state_dict())
+
+
+def test_a_player_of_a_file_that_says_nothing_of_layer_norms_has_none(tmp_path):
+    ActorPolicy.of(make().policy).save(tmp_path / "new.zip")
+    tampered(tmp_path / "new.zip", tmp_path / "old.zip", drop("player", "layer_norm"))
+    assert [type(layer) for layer in load_player(tmp_path / "old.zip").actor.network(0)] == [nn.Linear, nn.ReLU, nn.Linear]
 
 
 def test_a_discrete_model_comes_back(tmp_path):

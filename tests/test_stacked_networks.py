@@ -13,7 +13,7 @@ from stable_baselines3.td3.policies import Actor, ContinuousCritic
 from torch import nn
 
 from sb3_kfcv.common.layout import AgentLayout
-from sb3_kfcv.common.stacked_networks import StackedMLP
+from sb3_kfcv.common.stacked_networks import StackedLayerNorm, StackedMLP
 from sb3_kfcv.maddpg.policies import OwnObservationCritics, StackedActors, StackedCritics
 
 SIZES = [5, 7, 6, 2]
@@ -37,26 +37,37 @@ def spread_inputs(stack, x):
     return x.expand(stack.n_members, -1, -1)
 
 
+def scatter_norms(module):
+    """Give the layer norms weights and biases that tell them apart; without norms nothing is drawn."""
+    for layer in module.modules():
+        if isinstance(layer, StackedLayerNorm):
+            nn.init.normal_(layer.weight, 1.0, 0.5)
+            nn.init.normal_(layer.bias, 0.0, 0.5)
+    return module
+
+
+NORMS = pytest.mark.parametrize("layer_norm", [False, True], ids=["", "layer norm"])
 INPUTS = pytest.mark.parametrize("common_input", [False, True], ids=["own inputs", "a common input"])
 
 
 def stack_and_input(common_input, batch=4, **kwargs):
-    stack = StackedMLP(6, SIZES, common_input=common_input, **kwargs)
+    stack = scatter_norms(StackedMLP(6, SIZES, common_input=common_input, **kwargs))
     return stack, th.randn(1 if common_input else stack.n_members, batch, SIZES[0])
 
 
+@NORMS
 @INPUTS
-def test_outputs_are_those_of_separate_networks(common_input):
-    stack, x = stack_and_input(common_input)
+def test_outputs_are_those_of_separate_networks(common_input, layer_norm):
+    stack, x = stack_and_input(common_input, layer_norm=layer_norm)
     expected = th.stack([net(own) for net, own in zip(separate(stack), spread_inputs(stack, x), strict=True)])
     close(stack(x), expected)
     close(stack.evaluate(x), expected)
 
 
+@NORMS
 @pytest.mark.parametrize("members", [None, [0, 3, 1, 0]])
-def test_one_member_alone(members):
-    stack = StackedMLP(6, SIZES, members=members)
-    x = th.randn(stack.n_members, 4, SIZES[0])
+def test_one_member_alone(members, layer_norm):
+    stack, x = stack_and_input(False, members=members, layer_norm=layer_norm)
     for member in range(stack.n_members):
         close(stack.one(member, x[member]), stack(x)[member])
 
@@ -81,6 +92,10 @@ KINDS = {
     "shared by equal runs": {"members": [i // 2 for i in range(12)]},
     "shared by equal runs, tanh": {"members": [i // 2 for i in range(12)], "activation_fn": nn.Tanh},
     "shared, tanh": {"members": [0, 0, 1, 2, 3, 4, 5, 0], "activation_fn": nn.Tanh},
+    "layer norm": {"layer_norm": True},
+    "layer norm, tanh": {"layer_norm": True, "activation_fn": nn.Tanh},
+    "layer norm, shared": {"layer_norm": True, "members": [0, 3, 1, 0, 2, 4, 5, 0]},
+    "layer norm, shared by equal runs": {"layer_norm": True, "members": [i // 2 for i in range(12)]},
 }
 
 
@@ -89,7 +104,7 @@ KINDS = {
 @INPUTS
 def test_evaluation_and_backward_are_those_of_autograd(common_input, kind, hidden):
     """Twice, with other inputs: nothing of the first evaluation is left in the tensors that the second uses again."""
-    stack = StackedMLP(6, [5, *hidden, 2], common_input=common_input, **KINDS[kind]).double()
+    stack = scatter_norms(StackedMLP(6, [5, *hidden, 2], common_input=common_input, **KINDS[kind])).double()
     for _ in range(2):
         x = th.randn(1 if common_input else stack.n_members, 4, 5, dtype=th.double)
         gradient = th.randn(stack.n_members, 4, 2, dtype=th.double)
@@ -134,9 +149,9 @@ def test_a_copy_evaluates_with_its_own_parameters(copied, activation_fn):
     close(stack.evaluate(x), stack(x))
 
 
-@pytest.mark.parametrize("layer", ["first", "rest.0", "rest.1"])
+@pytest.mark.parametrize("layer", ["first", "rest.0", "rest.1", "norms.0"])
 def test_evaluations_see_new_data_of_any_parameter(layer):
-    stack, x = stack_and_input(False)
+    stack, x = stack_and_input(False, layer_norm=True)
     before = stack.evaluate(x).clone()
     weight = stack.get_parameter(f"{layer}.weight")
     weight.data = th.zeros_like(weight)
@@ -147,16 +162,18 @@ def test_evaluations_see_new_data_of_any_parameter(layer):
 @pytest.mark.parametrize("members", [None, [0, 3, 1, 0]])
 @INPUTS
 def test_frozen_parameters_get_no_gradient(common_input, members):
-    stack, x = stack_and_input(common_input, members=members)
+    stack, x = stack_and_input(common_input, members=members, layer_norm=True)
     for frozen in (False, True):
         stack.first.requires_grad_(not frozen)
         stack.rest[0].bias.requires_grad_(not frozen)
+        stack.norms[1].weight.requires_grad_(not frozen)
         stack.evaluate(x)
         stack.backward(th.ones(stack.n_members, 4, SIZES[-1]))
     assert {name for name, parameter in stack.named_parameters() if parameter.grad is None} == {
         "first.weight",
         "first.bias",
         "rest.0.bias",
+        "norms.1.weight",
     }
     stack.clip_gradients(1e-3)
     assert stack.gradient_norms().max() < 1.1e-3
@@ -192,9 +209,10 @@ def test_odd_activations_are_followed_too(activation_fn):
         close(parameter.grad, theirs)
 
 
-def test_a_borrower_evaluates_in_the_tensors_of_its_lender():
-    one, x = stack_and_input(False)
-    other = StackedMLP(6, SIZES)
+@NORMS
+def test_a_borrower_evaluates_in_the_tensors_of_its_lender(layer_norm):
+    one, x = stack_and_input(False, layer_norm=layer_norm)
+    other = StackedMLP(6, SIZES, layer_norm=layer_norm)
     other.borrow(one)
     values = one.evaluate(x)
     expected = other(x)
@@ -209,6 +227,20 @@ def test_network_is_made_of_linear_layers_and_activations():
     assert [tuple(layer.weight.shape) for layer in layers[::2]] == [(7, 5), (6, 7), (2, 6)]
 
 
+def test_layer_norms_stand_between_hidden_layers_and_activations():
+    layers = list(StackedMLP(2, SIZES, nn.Tanh, layer_norm=True).network(1))
+    norm, tanh = nn.LayerNorm, nn.Tanh
+    assert [type(layer) for layer in layers] == [nn.Linear, norm, tanh, nn.Linear, norm, tanh, nn.Linear]
+    assert [(layer.normalized_shape, layer.eps) for layer in layers[1::3]] == [((7,), 1e-5), ((6,), 1e-5)]
+    assert all(layer.weight.eq(1).all() and layer.bias.eq(0).all() for layer in layers[1::3])
+
+
+@pytest.mark.parametrize("given", ["yes", 1, None])
+def test_a_layer_norm_that_is_neither_yes_nor_no_is_refused(given):
+    with pytest.raises(ValueError, match=r"layer_norm is yes or no \(True or False\), not"):
+        StackedMLP(2, SIZES, layer_norm=given)
+
+
 def test_network_is_a_copy():
     stack, x = stack_and_input(None)
     before = stack(x)
@@ -216,9 +248,10 @@ def test_network_is_a_copy():
     close(stack(x), before)
 
 
+@NORMS
 @INPUTS
-def test_adam_steps_are_those_of_separate_networks(common_input):
-    stack, x = stack_and_input(common_input)
+def test_adam_steps_are_those_of_separate_networks(common_input, layer_norm):
+    stack, x = stack_and_input(common_input, layer_norm=layer_norm)
     plain = separate(stack)
     stacked_adam = th.optim.Adam(stack.parameters(), lr=1e-2)
     plain_adams = [th.optim.Adam(net.parameters(), lr=1e-2) for net in plain]
@@ -249,10 +282,11 @@ def as_separate_gradients(stack):
     ]
 
 
+@NORMS
 @INPUTS
-def test_gradients_are_clipped_network_by_network(common_input):
+def test_gradients_are_clipped_network_by_network(common_input, layer_norm):
     """Losses of very different sizes, so that some networks are clipped and some are not."""
-    stack, x = stack_and_input(common_input)
+    stack, x = stack_and_input(common_input, layer_norm=layer_norm)
     plain = separate(stack)
     scales = th.tensor([1e-3, 1.0, 10.0, 1e-2, 100.0, 0.3])
     (stack(x).square().mean((1, 2)) * scales).sum().backward()
@@ -282,9 +316,10 @@ def test_new_networks_are_drawn_as_nn_linear_draws():
 MEMBERS = [0, 0, 1, 0, 1]
 
 
+@NORMS
 @INPUTS
-def test_sharing_is_a_one_hot_number_in_the_input(common_input):
-    stack = StackedMLP(2, SIZES, common_input=common_input, members=MEMBERS)
+def test_sharing_is_a_one_hot_number_in_the_input(common_input, layer_norm):
+    stack = scatter_norms(StackedMLP(2, SIZES, common_input=common_input, members=MEMBERS, layer_norm=layer_norm))
     x = th.randn(1 if common_input else 5, 4, SIZES[0])
     nets = one_hot_networks(stack)
     outputs = stack(x)
@@ -294,9 +329,10 @@ def test_sharing_is_a_one_hot_number_in_the_input(common_input):
         close(outputs[member], stack.network(member)(own))
 
 
+@NORMS
 @INPUTS
-def test_shared_networks_learn_as_networks_with_a_one_hot_number(common_input):
-    stack = StackedMLP(2, SIZES, common_input=common_input, members=MEMBERS)
+def test_shared_networks_learn_as_networks_with_a_one_hot_number(common_input, layer_norm):
+    stack = scatter_norms(StackedMLP(2, SIZES, common_input=common_input, members=MEMBERS, layer_norm=layer_norm))
     x = th.randn(1 if common_input else 5, 4, SIZES[0])
     inputs = x.expand(5, -1, -1)
     nets = one_hot_networks(stack)
@@ -339,7 +375,7 @@ def layout(request):
 
 def critics_of(layout, agents=None, **kwargs):
     agents = range(layout.n_agents) if agents is None else agents
-    return StackedCritics(layout, agents, "observations", [8, 6], **kwargs)
+    return scatter_norms(StackedCritics(layout, agents, "observations", [8, 6], **kwargs))
 
 
 def in_blocks(critics, per_agent):
@@ -347,11 +383,13 @@ def in_blocks(critics, per_agent):
     return [th.stack([per_agent[i] for i in block.agents]) for block in critics.blocks]
 
 
+@NORMS
 @pytest.mark.parametrize("share", [False, True])
-def test_critics_of_own_observations_equal_separate_networks(share):
+def test_critics_of_own_observations_equal_separate_networks(share, layer_norm):
     """Each reads its agent's observation and all actions, with shared parameters the agent's own action first."""
     layout = AgentLayout(("a_0", "a_1", "b_0", "b_1"), ("a", "a", "b", "b"), (3, 3, 2, 2), (2, 2, 1, 1))
-    critics = OwnObservationCritics(layout, range(4), "own_observation", [8, 6], n_critics=2, share_parameters=share)
+    settings = {"n_critics": 2, "share_parameters": share, "layer_norm": layer_norm}
+    critics = scatter_norms(OwnObservationCritics(layout, range(4), "own_observation", [8, 6], **settings))
     inputs = th.randn(5, sum(layout.obs_sizes) + 6)
     observations, actions = inputs[:, :-6], inputs[:, -6:]
     orders = [[0, 1, 2, 3, 4, 5], [2, 3, 0, 1, 4, 5], [0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 5, 4]]
@@ -414,10 +452,11 @@ def load_linears(target, source):
         ours.load_state_dict(theirs.state_dict())
 
 
+@NORMS
 @pytest.mark.parametrize("share", [False, True])
-def test_own_action_replaced_equals_a_plain_evaluation_and_its_gradient(layout, share):
+def test_own_action_replaced_equals_a_plain_evaluation_and_its_gradient(layout, share, layer_norm):
     """Eq. 6: Q_i(s, a_1 … π_i(o_i) … a_N), and ∇_a of it, agent by agent through the whole critic."""
-    critics = critics_of(layout, share_parameters=share)
+    critics = critics_of(layout, share_parameters=share, layer_norm=layer_norm)
     n_obs = sum(layout.obs_sizes)
     inputs = th.randn(5, n_obs + sum(layout.action_sizes))
     new = {i: th.randn(5, layout.action_sizes[i], requires_grad=True) for i in range(layout.n_agents)}
@@ -455,7 +494,7 @@ def test_own_action_replaced_for_some_of_the_agents():
 
 
 def test_the_actors_step_gives_the_critics_no_gradient(layout):
-    critics = critics_of(layout)
+    critics = critics_of(layout, layer_norm=True)
     inputs = th.randn(5, sum(layout.obs_sizes) + sum(layout.action_sizes))
     new = {i: th.randn(5, layout.action_sizes[i]) for i in range(layout.n_agents)}
     critics.evaluate(inputs)

@@ -93,6 +93,7 @@ class StackedActors(nn.Module):
     :param net_arch: hidden sizes
     :param activation_fn: activation between layers
     :param share_parameters: one network per group of agents instead of one per agent
+    :param layer_norm: whether a layer norm stands before each activation
     """
 
     optimizer: th.optim.Optimizer
@@ -104,6 +105,7 @@ class StackedActors(nn.Module):
         net_arch: list[int],
         activation_fn: type[nn.Module] = nn.ReLU,
         share_parameters: bool = False,
+        layer_norm: bool = False,
     ) -> None:
         super().__init__()
         self.layout = layout
@@ -113,7 +115,7 @@ class StackedActors(nn.Module):
             members = shared_members(layout, block.agents) if share_parameters else None
             n_networks = max(members) + 1 if members else len(block.agents)
             sizes = [block.obs_size, *net_arch, block.action_size]
-            self.stacks.append(StackedMLP(n_networks, sizes, activation_fn, members=members))
+            self.stacks.append(StackedMLP(n_networks, sizes, activation_fn, members=members, layer_norm=layer_norm))
         self._latest: list[tuple[th.Tensor, th.Tensor]] = []  # per block: outputs and actions of the latest evaluation
 
     def forward(self, observations: th.Tensor, explore: bool = False, learning: bool = False) -> list[th.Tensor]:
@@ -179,7 +181,7 @@ class StackedActors(nn.Module):
         ]
 
     def network(self, agent: int) -> nn.Sequential:
-        """The network of one agent, as separate ``nn.Linear`` layers (a copy; its last layer is linear)."""
+        """The network of one agent, as separate layers (a copy; its last layer is linear)."""
         for stack, block in zip(self.stacks, self.blocks, strict=True):
             if agent in block.agents:
                 return stack.network(block.agents.index(agent))  # type: ignore[operator]
@@ -218,6 +220,7 @@ class ActorPolicy(BasePolicy):
     :param net_arch: hidden sizes
     :param activation_fn: activation between layers
     :param share_parameters: one network per group of agents instead of one per agent
+    :param layer_norm: whether a layer norm stands before each activation
     :param kwargs: for SB3's ``BasePolicy``
     """
 
@@ -232,6 +235,7 @@ class ActorPolicy(BasePolicy):
         net_arch: list[int],
         activation_fn: type[nn.Module] = nn.ReLU,
         share_parameters: bool = False,
+        layer_norm: bool = False,
         **kwargs: Any,
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=not layout.discrete, **kwargs)
@@ -241,6 +245,7 @@ class ActorPolicy(BasePolicy):
             "net_arch": list(net_arch),
             "activation_fn": activation_fn,
             "share_parameters": share_parameters,
+            "layer_norm": layer_norm,
         }
         self.actor = self.make_actor()
 

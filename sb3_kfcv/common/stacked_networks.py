@@ -18,9 +18,13 @@ from typing import Any
 
 import torch as th
 from torch import nn
+from torch.nn import functional as F
 
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.memory import require_memory
+
+# Added to the variances of a layer norm, as ``nn.LayerNorm`` does.
+NORM_EPS = 1e-5
 
 # Minibatch sizes whose tensors a stack keeps: those of a learner, of the worlds that it acts in, and of a refresh's chunks.
 SIZES_KEPT = 3
@@ -67,6 +71,42 @@ class StackedLinear(nn.Module):
         return th.baddbmm(self.bias[members], x, self.weight[members])
 
 
+class StackedLayerNorm(nn.Module):
+    """
+    ``n`` layer norms side by side: (n, batch, size) → (n, batch, size), initialised as ``nn.LayerNorm``.
+
+    :param n: number of norms
+    :param size: features of each
+    """
+
+    def __init__(self, n: int, size: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(th.ones(n, 1, size))
+        self.bias = nn.Parameter(th.zeros(n, 1, size))
+
+    def forward(self, z: th.Tensor, members: th.Tensor | None = None) -> th.Tensor:
+        """
+        :param z: (n, batch, size)
+        :param members: as for :meth:`StackedLinear.forward`
+        """
+        normed = F.layer_norm(z, z.shape[-1:], eps=NORM_EPS)
+        if members is None:
+            return th.addcmul(self.bias, normed, self.weight)
+        return th.addcmul(self.bias[members], normed, self.weight[members])
+
+    @th.no_grad()
+    def network(self, index: int) -> nn.LayerNorm:
+        """
+        One norm as a separate ``nn.LayerNorm`` (a copy).
+
+        :param index: its number
+        """
+        norm = nn.LayerNorm(self.weight.shape[-1], eps=NORM_EPS)
+        norm.weight.copy_(self.weight[index, 0])
+        norm.bias.copy_(self.bias[index, 0])
+        return norm
+
+
 class StackedMLP(nn.Module):
     """
     A stack of multi-layer perceptrons of one shape.
@@ -87,6 +127,8 @@ class StackedMLP(nn.Module):
     :param common_input: whether all read the same input
     :param members: network of each member; by default member i uses network i
     :param input_order: (members, in) order in which each member reads a common input; only with ``members``
+    :param layer_norm: whether a layer norm stands before each activation
+    :raises ValueError: if ``layer_norm`` is neither yes nor no
     """
 
     members: th.Tensor | None
@@ -100,8 +142,11 @@ class StackedMLP(nn.Module):
         common_input: bool = False,
         members: Sequence[int] | None = None,
         input_order: th.Tensor | None = None,
+        layer_norm: bool = False,
     ) -> None:
         super().__init__()
+        if type(layer_norm) is not bool:
+            raise ValueError(f"layer_norm is yes or no (True or False), not {layer_norm!r}")
         self.n_networks = n_networks
         self.n_members = n_networks if members is None else len(members)
         self.common_input = common_input
@@ -116,6 +161,7 @@ class StackedMLP(nn.Module):
         self.activation = activation_fn()
         self.first = StackedLinear(1 if common_input else n_networks, sizes[0], sizes[1] * (n_networks if common_input else 1))
         self.rest = nn.ModuleList(StackedLinear(n_networks, n_in, n_out) for n_in, n_out in pairwise(sizes[1:]))
+        self.norms = nn.ModuleList(StackedLayerNorm(n_networks, size) for size in sizes[1:-1] if layer_norm)
         self.member_bias: nn.Parameter | None = None
         self._evaluations: dict[int, Evaluation] = {}  # by batch size
         self._lender: tuple[StackedMLP, ...] = ()
@@ -145,9 +191,7 @@ class StackedMLP(nn.Module):
             z = self.first(x, self.members)
         if self.member_bias is not None:
             z = z + self.member_bias
-        for layer in self.rest:
-            z = layer(self.activation(z), self.members)
-        return z
+        return self._after_first(z, self.members)
 
     def one(self, member: int, x: th.Tensor) -> th.Tensor:
         """
@@ -162,9 +206,15 @@ class StackedMLP(nn.Module):
         z = self.first(x.unsqueeze(0), network)
         if self.member_bias is not None:
             z = z + self.member_bias[member]
-        for layer in self.rest:
-            z = layer(self.activation(z), network)
-        return z[0]
+        return self._after_first(z, network)[0]
+
+    def _after_first(self, z: th.Tensor, members: Any) -> th.Tensor:
+        """Outputs, from the pre-activations of the first layer."""
+        for i, layer in enumerate(self.rest):
+            if self.norms:
+                z = self.norms[i](z, members)
+            z = layer(self.activation(z), members)
+        return z
 
     def side_by_side(self, weight: th.Tensor, bias: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """First layer of all members on a common input: weight (in, members · hidden), bias (1, members · hidden)."""
@@ -263,7 +313,7 @@ class StackedMLP(nn.Module):
 
     def _gradients(self) -> Iterator[th.Tensor]:
         """Of weights and biases that have one, each viewed as (inputs, rows, networks per input, columns)."""
-        for layer in [self.first, *self.rest]:
+        for layer in [self.first, *self.rest, *self.norms]:
             for parameter in (layer.weight, layer.bias):
                 if parameter.grad is not None:
                     yield (
@@ -275,7 +325,7 @@ class StackedMLP(nn.Module):
     @th.no_grad()
     def network(self, index: int) -> nn.Sequential:
         """
-        One network of the stack as separate ``nn.Linear`` layers (a copy).
+        One network of the stack as separate ``nn.Linear`` and ``nn.LayerNorm`` layers (a copy).
 
         :param index: number of the member
         """
@@ -287,11 +337,12 @@ class StackedMLP(nn.Module):
         weights = [(self.first.weight.view(-1, self.sizes[1])[everything[0]], first_bias)]
         weights += [(layer.weight[net], layer.bias[net, 0]) for layer in self.rest]  # type: ignore[index]
         layers: list[nn.Module] = []
-        for weight, bias in weights:
+        for i, (weight, bias) in enumerate(weights):
             linear = nn.Linear(weight.shape[0], weight.shape[1])
             linear.weight.copy_(weight.T)
             linear.bias.copy_(bias)
-            layers += [linear, copy.deepcopy(self.activation)]
+            norms = [norm.network(net) for norm in self.norms[i : i + 1]]  # type: ignore[operator]
+            layers += [linear, *norms, copy.deepcopy(self.activation)]
         return nn.Sequential(*layers[:-1])
 
 
@@ -325,6 +376,8 @@ class Evaluation:
             self.common = stack.side_by_side(self.first, self.first_bias)
         self.member_bias = None if stack.member_bias is None else stack.member_bias.detach()
         self.x = self.first  # the input, once there is one
+        self.norms: list[tuple[nn.Parameter, nn.Parameter]] = [(norm.weight, norm.bias) for norm in stack.norms]  # type: ignore[misc]
+        self.normed: list[tuple[th.Tensor, th.Tensor]] = []  # by layer: rows before weight and bias; 1 / their deviations
         self.graphs: list[tuple[th.Tensor, th.Tensor]] = []  # of activations other than ReLU: what went in and what came out
         sizes = stack.sizes[1:]
         if lender is None:
@@ -379,8 +432,11 @@ class Evaluation:
         :return: (members, batch, out)
         """
         self.graphs.clear()
-        for z, (weight, bias), out in zip(self.layers, self.weights, self.layers[1:], strict=False):
-            self._layer(self._activate(z), weight, bias, out)
+        self.normed.clear()
+        for i, (weight, bias) in enumerate(self.weights):
+            if self.norms:
+                self._norm(i)
+            self._layer(self._activate(self.layers[i]), weight, bias, self.layers[i + 1])
         return self._unfolded(self.layers[-1])
 
     def backward(self, gradient: th.Tensor, parameters: bool = True) -> th.Tensor:
@@ -400,6 +456,8 @@ class Evaluation:
             weight = self.transposed[i] if self.members is None else self.transposed[i][self.members]
             gradient = th.bmm(gradient, weight, out=self.gradients[i])
             self._through_activation(i, gradient, parameters)
+            if self.norms:
+                self._through_norm(i, gradient, parameters)
         if parameters:
             self._write_first_gradients()
         return self._unfolded(self.gradients[0])
@@ -423,7 +481,11 @@ class Evaluation:
                 th.bmm(x.transpose(1, 2), gradient, out=into)
             else:
                 into.zero_().index_add_(0, self.members, th.bmm(x.transpose(1, 2), gradient))
-        if (into := gradient_of(bias)) is not None:
+        self._write_sum(gradient, bias)
+
+    def _write_sum(self, gradient: th.Tensor, parameter: nn.Parameter) -> None:
+        """Of a parameter that every row meets, (networks, 1, features), from the rows' gradients."""
+        if (into := gradient_of(parameter)) is not None:
             if self.members is None:
                 th.sum(gradient, dim=1, keepdim=True, out=into)
             else:
@@ -447,6 +509,29 @@ class Evaluation:
                     into.zero_().view(-1, self.width).index_add_(0, stack.members, gradient.sum(1))  # type: ignore[arg-type]
         if stack.member_bias is not None and (into := gradient_of(stack.member_bias)) is not None:
             th.sum(self._unfolded(gradient), dim=1, keepdim=True, out=into)
+
+    def _scale(self, i: int) -> tuple[th.Tensor, th.Tensor]:
+        """Weight and bias of the i-th norm, by row of its input."""
+        weight, bias = (parameter.detach() for parameter in self.norms[i])
+        return (weight, bias) if self.members is None else (weight[self.members], bias[self.members])
+
+    def _norm(self, i: int) -> None:
+        """Put the normed pre-activations in the place of the i-th ones."""
+        z, (weight, bias) = self.layers[i], self._scale(i)
+        normed, _, inverse = th.native_layer_norm(z, z.shape[-1:], None, None, NORM_EPS)
+        self.normed.append((normed, inverse))
+        th.addcmul(bias, normed, weight, out=z)
+
+    def _through_norm(self, i: int, gradient: th.Tensor, parameters: bool) -> None:
+        """Turn the gradient behind the i-th norm into the one before it; its outputs are not needed any more."""
+        (normed, inverse), (weight, _) = self.normed[i], self._scale(i)
+        product = th.mul(gradient, normed, out=self.layers[i])
+        if parameters:
+            self._write_sum(product, self.norms[i][0])
+            self._write_sum(gradient, self.norms[i][1])
+        gradient.mul_(weight)
+        along = product.mul_(weight).mean(-1, keepdim=True)
+        gradient.sub_(gradient.mean(-1, keepdim=True)).addcmul_(normed, along, value=-1).mul_(inverse)
 
     def _activate(self, z: th.Tensor) -> th.Tensor:
         if self.relu:

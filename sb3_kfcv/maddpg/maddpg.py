@@ -86,7 +86,8 @@ class MADDPG(JointAlgorithm):
     :param stats_window_size: episodes over which the logged rollout statistics are averaged
     :param tensorboard_log: folder of the TensorBoard log
     :param policy_kwargs: ``net_arch``, ``activation_fn``, ``n_critics`` (2: the lower of two target critics counts, as in
-        TD3, against over-estimation), ``optimizer_class``, ``optimizer_kwargs``
+        TD3, against over-estimation), ``layer_norm`` (before each activation, keeps values from diverging),
+        ``optimizer_class``, ``optimizer_kwargs``
     :param verbose: 0 none, 1 info, 2 debug
     :param seed: of networks, noise, replay and env
     :param device: ``"auto"``, ``"cpu"``, ``"cuda"``

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import pathlib
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from gymnasium import spaces
@@ -36,8 +36,10 @@ class CentralCritics(nn.Module):
     :param activation_fn: activation between layers
     :param n_critics: critics per agent (2 for clipped double Q-learning)
     :param share_parameters: one critic per group of agents instead of one per agent
+    :param layer_norm: whether a layer norm stands before each activation
     """
 
+    common_input: ClassVar[bool]  # whether the critics of a run read the same
     optimizer: th.optim.Optimizer
 
     def __init__(
@@ -49,6 +51,7 @@ class CentralCritics(nn.Module):
         activation_fn: type[nn.Module] = nn.ReLU,
         n_critics: int = 1,
         share_parameters: bool = False,
+        layer_norm: bool = False,
     ) -> None:
         super().__init__()
         self.layout = layout
@@ -62,7 +65,10 @@ class CentralCritics(nn.Module):
             for run, positions in enumerate(self.positions):
                 members = shared_members(layout, [agents[i] for i in positions]) if share_parameters else None
                 n_networks = max(members) + 1 if members else len(positions)
-                self.stacks.append(self._stack(run, n_networks, net_arch, activation_fn, members))
+                sizes = [self._width(run), *net_arch, 1]
+                order = self.order if self.common_input else None
+                stack = StackedMLP(n_networks, sizes, activation_fn, self.common_input, members, order, layer_norm)
+                self.stacks.append(stack)
         self._places: list[tuple[int, list[int] | None]] = []  # of each block: its run, and its members there, None for all
         for i, block in enumerate(self.blocks):
             run = next(r for r, positions in enumerate(self.positions) if block.positions[0] in positions)
@@ -77,10 +83,8 @@ class CentralCritics(nn.Module):
         """Places among the learning agents of each run's agents."""
         raise NotImplementedError
 
-    def _stack(
-        self, run: int, n_networks: int, net_arch: list[int], activation_fn: type[nn.Module], members: list[int] | None
-    ) -> StackedMLP:
-        """The critics of a run."""
+    def _width(self, run: int) -> int:
+        """How many numbers each critic of a run reads."""
         raise NotImplementedError
 
     def _read(self, inputs: th.Tensor) -> list[th.Tensor]:
@@ -175,7 +179,7 @@ class CentralCritics(nn.Module):
         return values if len(self.positions) == 1 else values[self.positions[run]]
 
     def network(self, position: int, critic: int = 0) -> nn.Sequential:
-        """One critic as separate ``nn.Linear`` layers (a copy); ``position`` counts the learning agents."""
+        """One critic as separate layers (a copy); ``position`` counts the learning agents."""
         for run, positions in enumerate(self.positions):
             if position in positions:
                 return self.stacks[critic * len(self.positions) + run].network(positions.index(position))  # type: ignore[operator]
@@ -188,14 +192,13 @@ class StackedCritics(CentralCritics):
     first layers of all are one product.
     """
 
+    common_input = True
+
     def _runs(self) -> list[list[int]]:
         return [sorted(position for block in self.blocks for position in block.positions)]
 
-    def _stack(
-        self, run: int, n_networks: int, net_arch: list[int], activation_fn: type[nn.Module], members: list[int] | None
-    ) -> StackedMLP:
-        sizes = [self.input_size, *net_arch, 1]
-        return StackedMLP(n_networks, sizes, activation_fn, common_input=True, members=members, input_order=self.order)
+    def _width(self, run: int) -> int:
+        return self.input_size
 
     def _read(self, inputs: th.Tensor) -> list[th.Tensor]:
         return [inputs.unsqueeze(0)]
@@ -211,6 +214,8 @@ class OwnObservationCritics(CentralCritics):
     nearest sheep?) need not be worked out from absolute positions. The inputs are all observations, then the joint action.
     """
 
+    common_input = False
+
     def _runs(self) -> list[list[int]]:
         for i, block in enumerate(self.blocks):
             order = (
@@ -219,11 +224,8 @@ class OwnObservationCritics(CentralCritics):
             self.register_buffer(f"_read_order_{i}", None if order is None else order.argsort(1).flatten(), persistent=False)
         return [block.positions for block in self.blocks]
 
-    def _stack(
-        self, run: int, n_networks: int, net_arch: list[int], activation_fn: type[nn.Module], members: list[int] | None
-    ) -> StackedMLP:
-        sizes = [self.blocks[run].obs_size + sum(self.layout.action_sizes), *net_arch, 1]
-        return StackedMLP(n_networks, sizes, activation_fn, members=members)
+    def _width(self, run: int) -> int:
+        return self.blocks[run].obs_size + sum(self.layout.action_sizes)
 
     def _read(self, inputs: th.Tensor) -> list[th.Tensor]:
         """The own observation, then all actions in the order in which each agent reads them: (agents, batch, input)."""
@@ -297,6 +299,7 @@ class MADDPGPolicy(ActorPolicy):
     :param activation_fn: activation between layers
     :param n_critics: critics per agent
     :param share_parameters: one actor and one critic per group instead of per agent
+    :param layer_norm: put a layer norm, as of ``torch.nn.LayerNorm``, before each activation of actors and critics
     :param optimizer_class: optimiser of actors and of critics
     :param optimizer_kwargs: its arguments, without the learning rate; Adam is fused by default (several times faster)
     """
@@ -317,6 +320,7 @@ class MADDPGPolicy(ActorPolicy):
         activation_fn: type[nn.Module] = nn.ReLU,
         n_critics: int = 1,
         share_parameters: bool = False,
+        layer_norm: bool = False,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
@@ -332,6 +336,7 @@ class MADDPGPolicy(ActorPolicy):
             actor_arch,
             activation_fn,
             share_parameters,
+            layer_norm,
             optimizer_class=optimizer_class,
             optimizer_kwargs=optimizer_kwargs,
         )
@@ -343,13 +348,14 @@ class MADDPGPolicy(ActorPolicy):
             "activation_fn": activation_fn,
             "n_critics": n_critics,
             "share_parameters": share_parameters,
+            "layer_norm": layer_norm,
             "optimizer_class": optimizer_class,
             "optimizer_kwargs": optimizer_kwargs,
         }
 
         def make_critic() -> CentralCritics:
             return CRITIC_INPUTS[critic_input](
-                layout, agents, critic_input, critic_arch, activation_fn, n_critics, share_parameters
+                layout, agents, critic_input, critic_arch, activation_fn, n_critics, share_parameters, layer_norm
             )
 
         self.actor_target = self.make_actor()

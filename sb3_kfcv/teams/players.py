@@ -253,6 +253,7 @@ def _actors_of(attributes: Mapping[str, Any], parameters: Mapping[str, Any]) -> 
         net_arch=list(hidden_sizes(settings.get("net_arch"))[0]),
         activation_fn=settings.get("activation_fn", nn.ReLU),
         share_parameters=attributes.get("share_parameters", False),
+        layer_norm=settings.get("layer_norm", False),
         **{name: attributes[name] for name in ("observation_space", "action_space", "layout")},
     )
 
