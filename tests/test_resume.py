@@ -791,7 +791,7 @@ def refusal(capsys, *words):
 
 
 def test_what_is_no_run_cannot_be_resumed(tmp_path, capsys, cut):
-    assert refusal(capsys, "--resume", str(tmp_path)) == f"error: {tmp_path} is no run folder: it has no */args.yml\n"
+    assert refusal(capsys, "--resume", str(tmp_path)) == f"error: {tmp_path} is no folder of a run of zoo/train.py\n"
     beside = refusal(capsys, "--resume", f"{cut.path}1")
     assert beside == f'error: unknown run folder "{cut.path}1"; did you mean "{cut.path}"?\n'
 

@@ -200,7 +200,7 @@ def test_a_second_signal_stops_at_once(tmp_path, capsys):
 
 BAD_INPUT = [
     ("--env Graslnd-v0", 'unknown environment "Graslnd-v0"; did you mean "Grassland-v0"?'),
-    ("--env CartPole-v1", "has no entry for CartPole-v1; it has Grassland-v0, HardSpread-v0"),
+    ("--env CartPole-v1", "has no entry for CartPole-v1, only Grassland-v0, HardSpread-v0"),
     ("--algo madpg", 'unknown algorithm "madpg"; did you mean "maddpg"?'),
     ("--sed 3", 'unknown flag "--sed"; did you mean "--seed"?'),
     ("-n many", '"many" is no whole number'),
@@ -233,7 +233,7 @@ BAD_INPUT = [
     ("--team wolf --opponents sheep:fle", 'did you mean "flee"?'),
     ("--eval-episodes 0", "--eval-episodes is 0; it must be at least 1"),
     ("--env mpe2/simple_tg_v3", 'unknown environment "mpe2/simple_tg_v3"; did you mean "mpe2/simple_tag_v3"?'),
-    ("--env classic/rps_v2", "has no entry for classic/rps_v2; it has Grassland-v0, HardSpread-v0"),
+    ("--env classic/rps_v2", "has no entry for classic/rps_v2, only Grassland-v0, HardSpread-v0"),
     ("--vec-env many", "argument --vec-env: invalid choice: 'many'"),
     ("-params env_wrapper:os.system", 'env_wrapper "os.system" is no wrapper of SuperSuit'),
     ("-params env_wrapper:supersuit.frame_stak_v2", 'did you mean "supersuit.frame_stack_v2"?'),

@@ -171,27 +171,29 @@ def test_the_labels_of_players(player, name):
 REFUSED = [
     ("--team wolf=maddpg wolf=per_maddpg", "--team says twice who plays wolf"),
     ("--team wolf=maddpg wolf=chase", "--team says twice who plays wolf"),
-    ("--team sheep=graze", "no team learns: give one an algorithm, such as --team GROUP=maddpg"),
+    ("--team sheep=graze", "no team learns: sheep is played by graze, and the algorithms are maddpg"),
     ("--team =maddpg", '--team takes GROUP=ALGORITHM or GROUP=PLAYER, such as sheep=graze; got "=maddpg"'),
     ("--team wolf=", '--team takes GROUP=ALGORITHM or GROUP=PLAYER, such as sheep=graze; got "wolf="'),
-    ("--team wulf=maddpg sheep=graze", "unknown group 'wulf'; this world has wolf, sheep"),
+    ("--team wulf=maddpg sheep=graze", 'unknown group or scalar reward "wulf"; did you mean "wolf"?'),
     ("--team wolf=maddpg goat=maddpg", "unknown group 'goat'; this world has wolf, sheep"),
-    ("--team wolf=maddpg", "team='wolf' needs players for the other groups"),
-    ("--team wolf=maddpg goat=graze", "players were given for ['goat']; to be played are ['sheep']"),
+    ("--team wolf=maddpg", "nobody plays sheep: add it to --team, such as sheep=random"),
+    ("--team wolf=foo", "no team learns: wolf is played by foo, and the algorithms are maddpg, per_maddpg, kfcv_maddpg"),
+    ("--team wolf=maddpg sheep=graze -params pool_share:0.5", "pool_share is for teams that learn against each other"),
+    ("--team wolf=maddpg goat=graze", "unknown group 'goat'; this world has wolf, sheep"),
     ("--team wolf=maddpg sheep=graz", 'unknown scripted policy of \'sheep\' "graz"; did you mean "graze"?'),
     ("--team wolf=maddpg sheep=madpg", "unknown scripted policy of 'sheep' \"madpg\""),
     ("--team wolf=maddpg sheep=graze,graz", 'did you mean "graze"?'),
     ("--team wolf=maddpg sheep=none.zip", "there is no file none.zip to take a player of"),
-    ("--team wolf=maddpg sheep=zoo/", "zoo is no run folder"),
+    ("--team wolf=maddpg sheep=zoo/", "zoo is no folder of a run of zoo/train.py"),
     ("--team wolf=maddpg sheep=setup.py.zip", "there is no file setup.py.zip to take a player of"),
     ("--team wolf=maddpg sheep=./setup.py", "setup.py is no sb3-kfcv file"),
     ("--team wolf=maddpg sheep=MODEL --env-kwargs n_wolves:3 n_sheep:2", "is for another world: 2 wolf"),
     ("--team sheep=maddpg wolf=MODEL --env-kwargs n_wolves:2 n_sheep:2 n_grass:1", "plays sheep; wanted is a player of wolf"),
     ("--team wolf=maddpg sheep=DAMAGED", "damaged.zip"),
     ("--algo co_training", "--algo co_training needs teams, such as --team wolf=kfcv_maddpg sheep=maddpg"),
-    ("--env HardSpread-v0 --team wolf=maddpg", "unknown group 'wolf'; this world has agent"),
+    ("--env HardSpread-v0 --team wolf=maddpg", 'unknown group or scalar reward "wolf"; known: agent'),
     ("--env HardSpread-v0 --team agent=maddpg wall=maddpg", "unknown group 'wall'; this world has agent"),
-    ("--env HardSpread-v0 --team agent=maddpg wall=random", "team='agent' is everybody in this world"),
+    ("--env HardSpread-v0 --team agent=maddpg wall=random", "unknown group 'wall'; this world has agent"),
     ("--yardstick sheep=graze", "--yardstick measures a team; say which one learns with --team"),
     ("--team wolf=maddpg sheep=graze --yardstick sheep", '--yardstick takes GROUP=PLAYER, such as sheep=graze; got "sheep"'),
     ("--team wolf=maddpg sheep=graze --yardstick goat=graze", 'unknown group "goat"'),
@@ -199,7 +201,7 @@ REFUSED = [
     ("--team wolf=maddpg sheep=graze --yardstick sheep=none.zip", "there is no file none.zip to take a player of"),
     ("--team wolf=maddpg sheep=graze --player-freq 0", "--player-freq is 0; it must be at least 1, or -1"),
     ("--player-freq -5", "--player-freq is -5; it must be at least 1, or -1"),
-    ("--team wolf=maddpg sheep=maddpg -params goat.gamma:0.9", 'unknown hyperparameter of wolf, "goat"'),
+    ("--team wolf=maddpg sheep=maddpg -params goat.gamma:0.9", 'unknown team "goat"; known: sheep, wolf'),
     ("--team wolf=maddpg sheep=maddpg -params wolf.gama:0.9", 'unknown hyperparameter of wolf, "gama"; did you mean "gamma"?'),
     ("--team wolf=maddpg sheep=maddpg -params gama:0.9", 'unknown hyperparameter of wolf, "gama"; did you mean "gamma"?'),
     ("--team wolf=maddpg sheep=maddpg -params wolf.gamma:high", "gamma is 'high'; it must be a number"),
@@ -296,3 +298,27 @@ def test_twelve_kills_at_random_moments_change_nothing(tmp_path, algos):
     pools = ["pool_share:0.4", "pool_freq:100", "pool_size:3", "pool_sampling:win_rate"]
     words = ["--team", f"wolf={algos[0]}", f"sheep={algos[1]}", "-params", *pools, "buffer_size:500"]
     kill_and_go_on(tmp_path, words, "co_training", steps=2000, kills=12, seed=len(algos[0]))
+
+
+def test_the_best_model_of_a_team_is_that_of_its_own_return(sheep):
+    """Grassland's own reward is the wolves'; where the sheep learn, it is theirs."""
+    evaluations = np.load(sheep.parent / "evaluations.npz")
+    np.testing.assert_allclose(evaluations["results"], evaluations["return_sheep"], rtol=1e-5)
+
+
+def test_a_yardstick_counts_what_its_team_gets(both):
+    measured = np.load(both.path / "evaluations_sheep_vs_random.npz")
+    np.testing.assert_array_equal(measured["results"], measured["return_sheep"])
+
+
+def test_one_team_of_a_co_training_is_trained_on_alone(tmp_path, both):
+    words = ["-f", str(tmp_path), "-i", str(both.path / "best_sheep.zip"), "-n", "40", "--eval-freq", "-1", "--verbose", "0"]
+    assert train.main([*words, "--env-kwargs", *SMALL["Grassland-v0"], "--team", "sheep", "wolf=chase"]) == 0
+    (config,) = tmp_path.glob("*/*/*/config.yml")
+    settings = yaml.safe_load(config.read_text())
+    assert (config.parts[-4], settings["team"], settings["gamma"]) == ("per_maddpg", "sheep", 0.9)
+
+
+def test_a_learner_of_a_co_training_knows_its_age(both):
+    """What an evaluation saves has counted the step that it comes after."""
+    assert PERMADDPG.load(both.path / "best_sheep.zip").num_timesteps in (60, 120)

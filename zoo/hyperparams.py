@@ -149,7 +149,8 @@ def load_entry(algo: str, env_id: str, conf_file: str | Path | None = None, pres
     entries = read_map(path)
     if env_id not in entries:
         if env_id in gym.registry or find_world(env_id) is not None:
-            raise ValueError(f"{path} has no entry for {env_id}; it has {', '.join(map(str, entries))}")
+            listed = ", ".join(map(str, entries))
+            raise ValueError(f"{path} has no entry for {env_id}, only {listed}; give a YAML file that has one with -conf")
         raise ValueError(unknown_environment(env_id))
     entry = entries[env_id]
     if not isinstance(entry, dict):

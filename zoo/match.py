@@ -27,7 +27,7 @@ from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.matches import Arena, PayOffTable, Side, curve, pay_off_table
 from sb3_kfcv.matches.pay_off import interval_of, shares_of
-from sb3_kfcv.saving.archive import library_versions
+from sb3_kfcv.saving.archive import FileFormatError, library_versions
 from sb3_kfcv.saving.files import is_path
 from sb3_kfcv.teams.players import scripted_for
 from sb3_kfcv.vec_env.make import make_vec_env
@@ -140,6 +140,30 @@ def found(player: str, group: str, best: bool = False) -> list[str]:
     return [str(file_to_play(path, group if best else None)) if is_path(path) else path for path in paths]
 
 
+def fit(arena: Arena, group: str, player: str, best: bool) -> list[str]:
+    """
+    As :func:`found`; of what a pattern matches, only those that can play the group here. A note names the others.
+
+    :raises FileFormatError: for a damaged file
+    """
+    players = found(player, group, best)
+    if not glob.has_magic(player):
+        return players
+    fitting = []
+    for path in players:
+        try:
+            arena.side(group, path)
+        except FileFormatError:
+            raise
+        except ValueError as error:
+            print(f"note: left out: {error}", file=sys.stderr)
+        else:
+            fitting.append(path)
+    if not fitting:
+        raise ValueError(f'nothing that matches "{player}" can play {group} here')
+    return fitting
+
+
 def side(arena: Arena, group: str, player: str) -> Side:
     """
     Load a player.
@@ -221,7 +245,7 @@ def build(args: argparse.Namespace) -> Matches:
     sources, players = {}, {}
     for group in order:
         default = scripted_for(arena.layout, group) if group in groups else [RANDOM]
-        sources[group] = labelled([one for word in named.get(group, default) for one in found(word, group, args.best)])
+        sources[group] = labelled([one for word in named.get(group, default) for one in fit(arena, group, word, args.best)])
         if group not in groups and len(sources[group]) > 1:
             raise ValueError(
                 f"{' and '.join(groups)} make the table; give {group} one player, not {', '.join(sources[group])}"
@@ -296,8 +320,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         matches = build(args)
         folder = Path(args.output)
         folder.mkdir(parents=True, exist_ok=True)
-    except (*REFUSALS, OSError) as error:
+    except REFUSALS as error:
         print(f"error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except OSError as error:
+        print(f"error: the results cannot be written to {args.output}: {error.strerror}", file=sys.stderr)
         return BAD_INPUT
     about = {
         "command": shlex.join(words),

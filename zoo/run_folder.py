@@ -87,7 +87,7 @@ class RunFolder:
         if len(found) != 1:
             near = [str(folder.parent.parent) for folder in path.parent.glob("*/*/args.yml")]
             raise ValueError(
-                unknown_name("run folder", path, near) if near else f"{path} is no run folder: it has no */args.yml"
+                unknown_name("run folder", path, near) if near else f"{path} is no folder of a run of zoo/train.py"
             )
         return cls(path, read_map(found[0])["env"])
 

@@ -8,13 +8,14 @@ from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sb3_kfcv import ALGOS
+from sb3_kfcv import ALGOS, MADDPG
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.saving.files import is_path
 from sb3_kfcv.teams.players import scripted_for
 from zoo.hyperparams import merged
 from zoo.run_folder import file_to_play
+from zoo.typed_settings import settings_of
 
 
 @dataclass
@@ -48,7 +49,8 @@ def parse_teams(words: Sequence[str] | str | None) -> Teams:
         else:
             teams.players[group] = parse_player(player)
     if teams.players and not teams.learners:
-        raise ValueError(f"no team learns: give one an algorithm, such as --team GROUP={next(iter(ALGOS))}")
+        group, player = next(iter(teams.players.items()))
+        raise ValueError(f"no team learns: {group} is played by {player}, and the algorithms are {', '.join(ALGOS)}")
     return teams
 
 
@@ -137,12 +139,15 @@ def with_teams(settings: Mapping[str, Any], pairs: Mapping[str, Any], own: Seque
     :param settings: with a map of ``teams``
     :param pairs: name → value
     :param own: names of settings that are not a team's
+    :raises ValueError: for the settings of a team that there is not
     """
     teams: dict[str, Any] = dict(settings["teams"])
     changed = dict(settings)
     for name, value in pairs.items():
         if name in teams:
             teams[name] = merged(teams[name], value) if isinstance(value, dict) else value  # which is refused by its name
+        elif isinstance(value, dict) and name not in own and name not in settings_of(MADDPG):
+            raise ValueError(unknown_name("team", name, teams))
         elif name in own:
             changed = merged(changed, {name: value})
         else:

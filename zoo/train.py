@@ -29,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import e
 from sb3_kfcv import CoTraining
 from sb3_kfcv.common.callbacks import MultiAgentEvalCallback, SavePlayers, StopOnSignal
 from sb3_kfcv.common.checks import NonFiniteError
+from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.patient_logs import PatientResultsWriter
 from sb3_kfcv.maddpg import MADDPG
@@ -40,6 +41,7 @@ from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import facts_of, layout_of, make_vec_env, metric_names_of
 from sb3_kfcv.vec_env.named_wrappers import find_wrappers
 from zoo.hyperparams import (
+    ALGORITHMS,
     CO_TRAINING,
     OF_THE_RUN,
     PRESETS,
@@ -52,7 +54,7 @@ from zoo.hyperparams import (
     merged,
     parse_pairs,
 )
-from zoo.run_folder import RunFolder, file_name, read_map
+from zoo.run_folder import RunFolder, file_name, file_to_play, read_map
 from zoo.teams import Teams, Yardstick, parse_teams, with_teams, yardsticks
 from zoo.typed_settings import settings_of
 
@@ -69,6 +71,9 @@ EVAL_SEED_OFFSET = 1_000_000
 
 # Without --log-interval: log once per so many episodes of each world.
 EPISODES_PER_LOG = 4
+
+# What only co-training knows.
+POOL_SETTINGS = ("pool_share", "pool_freq", "pool_size", "pool_sampling")
 
 # Without --player-freq: a team's players are saved every so many env steps.
 PLAYER_FREQ = 25_000
@@ -97,7 +102,7 @@ def make_parser() -> Parser:
     """The command line."""
     parser = Parser(description="Train multi-agent algorithms.", allow_abbrev=False)
     add = parser.add_argument
-    add("--algo", default="kfcv_maddpg", help="maddpg, per_maddpg or kfcv_maddpg (default: %(default)s)")
+    add("--algo", default="kfcv_maddpg", help=f"{', '.join(ALGORITHMS)}; default: %(default)s")
     add("--env", default="Grassland-v0", help="id of the world (default: %(default)s)")
     add("-n", "--n-timesteps", type=whole_number, default=-1, help="env steps; with -i so many more (default: the YAML's)")
     add(
@@ -224,6 +229,8 @@ def resolve(args: argparse.Namespace) -> Hyperparams:
     entry = {} if args.trained_agent else begun_entry(args, teams)
     if args.trained_agent:
         model_path = Path(args.trained_agent)
+        if model_path.is_dir():
+            model_path = file_to_play(model_path)
         if not model_path.is_file():
             raise ValueError(f"there is no model {model_path}")
         args.trained_agent = str(model_path.resolve())  # the run may be resumed from elsewhere
@@ -233,9 +240,14 @@ def resolve(args: argparse.Namespace) -> Hyperparams:
             if args.preset or args.conf_file:
                 raise ValueError(f"a continued run keeps its settings ({config}); change single ones with -params")
             entry = read_map(config)
+            if "teams" in entry and args.algo != CO_TRAINING:
+                args.algo, entry = of_one_team(entry, next(iter(teams.learners), model_path.stem.removeprefix("best_")))
         else:
             entry = begun_entry(args, teams)
     pairs = parse_pairs("-params", args.hyperparams)
+    for name in pairs if args.algo != CO_TRAINING else ():
+        if name in POOL_SETTINGS:
+            raise ValueError(f"{name} is for teams that learn against each other, such as --team wolf=maddpg sheep=maddpg")
     if args.algo == CO_TRAINING:
         entry = with_teams(entry, pairs, [*OF_THE_RUN, *settings_of(CoTraining)])
     else:
@@ -247,6 +259,22 @@ def resolve(args: argparse.Namespace) -> Hyperparams:
     if args.n_timesteps != -1 and not args.trained_agent:
         entry["n_timesteps"] = args.n_timesteps
     return check(args.algo, args.env, entry)
+
+
+def of_one_team(config: Mapping[str, Any], team: str) -> tuple[str, dict[str, Any]]:
+    """
+    The algorithm of a team that learnt beside others, and its settings, to train it on alone.
+
+    :param config: of the run
+    :param team: the team
+    :raises ValueError: if the run had no such team
+    """
+    if team not in config["teams"]:
+        known = ", ".join(config["teams"])
+        raise ValueError(f"the run taught {known}: train on all of them with --algo {CO_TRAINING}, or one with --team")
+    own = dict(config["teams"][team])
+    of_the_run = {name: value for name, value in config.items() if name in OF_THE_RUN}
+    return own.pop("algo"), {**of_the_run, **own, "team": team}
 
 
 def begun_entry(args: argparse.Namespace, teams: Teams) -> dict[str, Any]:
@@ -277,7 +305,8 @@ def continue_as_begun(args: argparse.Namespace, model_path: Path) -> None:
     """
     for file in model_path.parent.glob("*/args.yml"):
         begun = read_map(file)
-        if (begun["algo"], begun["env"]) != (args.algo, args.env):
+        one_of_several = begun["algo"] == CO_TRAINING != args.algo  # whose algorithm the file itself tells
+        if begun["env"] != args.env or (begun["algo"] != args.algo and not one_of_several):
             raise ValueError(
                 f"{model_path} was trained by {begun['algo']} on {begun['env']}; "
                 f"continue it with --algo {begun['algo']} --env {begun['env']}"
@@ -317,7 +346,7 @@ def make_env(
     processes: bool = False,
 ) -> VecEnv:
     """
-    Worlds to train or to evaluate in.
+    Worlds to train or to evaluate in. Where one team learns, their reward is the mean over that team.
 
     :param hyperparams: the settings
     :param n_envs: number of worlds
@@ -331,6 +360,7 @@ def make_env(
         n_envs,
         seed,
         env_kwargs,
+        reward=hyperparams.model.get("team") or "default",
         wrappers=find_wrappers(hyperparams.env_wrapper),
         vec_env_cls=SubprocVecEnv if processes else None,
     )
@@ -357,6 +387,21 @@ def make_eval_env(args: argparse.Namespace, hyperparams: Hyperparams, env: VecEn
     if layout_of(eval_env) != layout_of(env):
         raise ValueError(f"--eval-env-kwargs {different} make a world whose agents are not those of the training")
     return eval_env
+
+
+def require_everybody(hyperparams: Hyperparams, layout: AgentLayout) -> None:
+    """
+    :param hyperparams: the settings
+    :param layout: who sits where
+    :raises ValueError: for a group that the world lacks, and for one that neither learns nor is played
+    """
+    model = hyperparams.model
+    learners = list(model.get("teams") or ([model["team"]] if model.get("team") else []))
+    for group in [*learners, *(model.get("opponents") or {})]:
+        layout.members(group)
+    for group in layout.group_names if learners else ():
+        if group not in learners and group not in (model.get("opponents") or {}):
+            raise ValueError(f"nobody plays {group}: add it to --team, such as {group}=random")
 
 
 def make_yardsticks(
@@ -433,6 +478,7 @@ def build(args: argparse.Namespace, resumed: RunFolder | None = None, then: Oppo
         args.seed = int(np.random.default_rng().integers(2**31))
     processes = args.vec_env == "subproc"
     env = make_env(hyperparams, hyperparams.n_envs, args.seed, hyperparams.env_kwargs, training=True, processes=processes)
+    require_everybody(hyperparams, layout_of(env))
     eval_env = make_eval_env(args, hyperparams, env)
     measured = make_yardsticks(args, hyperparams, eval_env, then.yardsticks)
     algorithm = find_algorithm(args.algo)

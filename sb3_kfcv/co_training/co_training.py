@@ -247,6 +247,7 @@ class CoTraining(JointAlgorithm):
         for learner in self.learners.values():
             learner.num_timesteps, learner._last_obs = self.num_timesteps, self._last_obs
             tried.append(learner.sample_own_action(learner.learning_starts, learner.action_noise, n_envs))
+            learner.num_timesteps += n_envs  # as this model's will be when callbacks see this step
         buffer_action = tried[0]
         for team, own in zip(self.learners, tried, strict=True):
             columns = self._acting.columns[team]

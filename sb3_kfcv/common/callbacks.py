@@ -40,8 +40,8 @@ class MultiAgentEvalCallback(EventCallback):
     :param deterministic: evaluate without exploration
     :param eval_at_start: evaluate also before the first step
     :param team: evaluate only what the model learns for this group, against ``opponents``: a yardstick that does not move,
-        while the reward against others that learn says little. The best model is then the one with the highest return of the
-        group, kept as ``best_<team>.zip``: the team's own learner, where several learn
+        while the reward against others that learn says little. The reward is then the return of the group, and the best model
+        is kept as ``best_<team>.zip``: the team's own learner, where several learn
     :param opponents: with ``team``: who plays each other group, see :func:`~sb3_kfcv.teams.players.find_player`
     :param name: what it logs under, in place of ``eval``; another one also writes to ``evaluations_<name>.npz``
     :param callback_after_eval: called after each evaluation
@@ -105,11 +105,13 @@ class MultiAgentEvalCallback(EventCallback):
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
         episodes = evaluate(self._player(), self.eval_env, self.n_eval_episodes, self.deterministic)
+        if self.team is not None:
+            episodes["reward"] = episodes[f"return_{self.team}"]
         self.timesteps.append(self.num_timesteps)
         self.evaluations.append(episodes)
         self._write()
         self._log(episodes)
-        self.last_mean_reward = float(episodes["reward" if self.team is None else f"return_{self.team}"].mean())
+        self.last_mean_reward = float(episodes["reward"].mean())
         if self.last_mean_reward > self.best_mean_reward:
             with going_on("the best model"):
                 if self.best_model_save_path is not None:
@@ -176,8 +178,8 @@ class MultiAgentEvalCallback(EventCallback):
         with patience(self.logger):
             self.logger.dump(self.num_timesteps)
         if self.verbose:
-            returns = {name.removeprefix("return_"): v for name, v in episodes.items() if name.startswith("return_")}
-            parts = ", ".join(f"{group} {with_interval(values)}" for group, values in returns.items())
+            groups = layout_of(self.eval_env).group_names
+            parts = ", ".join(f"{group} {with_interval(episodes[f'return_{group}'])}" for group in groups)
             reward = with_interval(episodes["reward"])
             with going_on("the evaluation's result"):
                 what = "evaluation" if self.name == "eval" else self.name

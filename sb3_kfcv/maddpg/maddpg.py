@@ -279,7 +279,8 @@ class MADDPG(JointAlgorithm):
             return None
         if not self.opponents:
             example = {group: "random" for group in others}
-            raise ValueError(f"team={self.team!r} needs players for the other groups, such as opponents={example}")
+            of_a_file = " (what only has predict is in no file: give it again)" if self.num_timesteps else ""
+            raise ValueError(f"team={self.team!r} needs players for the other groups, such as opponents={example}{of_a_file}")
         rng = np.random.default_rng(self.seed)
         return TeamPolicy(self.layout, self.opponents, rng, others, self.action_space, **self.world_facts)
 

@@ -53,6 +53,7 @@ class TeamPolicy:
         self.players: dict[str, Player] = {
             group: find_player(player, layout, group, self.rng, action_space, **facts) for group, player in players.items()
         }
+        self.width = layout.n_agents if layout.discrete else sum(layout.action_sizes)
         self.columns = {group: self._action_columns(group) for group in wanted}
         self._critic_columns = {group: _columns(layout, group) for group in wanted}
 
@@ -77,9 +78,8 @@ class TeamPolicy:
         :return: joint actions, float32 (B, action size) or, if the agents choose, int64 (B, agents); without the first
             axis for one row; and the state for the next call, ``None`` without mixtures
         """
-        layout = self.layout
-        width, dtype = (layout.n_agents, np.int64) if layout.discrete else (sum(layout.action_sizes), np.float32)
-        actions = np.zeros((*np.shape(observation)[:-1], width), dtype)
+        dtype = np.int64 if self.layout.discrete else np.float32
+        actions = np.zeros((*np.shape(observation)[:-1], self.width), dtype)
         line_up = self.line_up(len(np.atleast_2d(observation)), state, episode_start)
         return self.fill(actions, observation, deterministic, line_up), line_up
 
@@ -214,7 +214,13 @@ class TeamPolicy:
         """What one player does: (B, columns)."""
         if isinstance(player, ScriptedPolicy):
             return self._scripted_actions(player, rows)
-        return player.predict(rows, deterministic=deterministic)[0][:, columns]
+        actions = np.asarray(player.predict(rows, deterministic=deterministic)[0])
+        if actions.shape != (len(rows), self.width):
+            raise ValueError(
+                f"a player's predict gives joint actions of all agents, {(len(rows), self.width)}; "
+                f"that of {type(player).__name__} gave {actions.shape}"
+            )
+        return actions[:, columns]
 
     def _scripted_actions(self, policy: ScriptedPolicy, rows: np.ndarray) -> np.ndarray:
         """The group's actions, side by side (B, columns of the group)."""

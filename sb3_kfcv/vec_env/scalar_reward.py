@@ -26,5 +26,5 @@ def scalar_weights(layout: AgentLayout, reward: str) -> np.ndarray:
         members = list(layout.members(reward))
         weights[members] = 1 / len(members)
     else:
-        raise ValueError(unknown_name("scalar reward", reward, ["mean", "sum", *layout.group_names]))
+        raise ValueError(unknown_name("group or scalar reward", reward, ["mean", "sum", *layout.group_names]))
     return weights
