@@ -120,7 +120,7 @@ def test_the_scalar_can_be_chosen():
 
 
 def test_an_unknown_scalar_is_refused():
-    with pytest.raises(ValueError, match='unknown scalar reward "wolves"; did you mean "wolf"'):
+    with pytest.raises(ValueError, match='unknown group or scalar reward "wolves"; did you mean "wolf"'):
         ParticleVecEnv(GrasslandWorlds(1), reward="wolves")
 
 
