@@ -1,14 +1,11 @@
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Collection, Mapping
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
@@ -30,7 +27,7 @@ from sb3_kfcv.saving.attributes import check_attributes, require_own
 from sb3_kfcv.saving.values import UnwritableError, check_writable
 from sb3_kfcv.teams.players import require_players
 from sb3_kfcv.teams.team_policy import LineUp, TeamPolicy
-from sb3_kfcv.vec_env.make import facts_of, layout_of, wins_of
+from sb3_kfcv.vec_env.make import wins_of
 
 # Settings of a learner that belong to the whole.
 OF_THE_WHOLE = ("policy", "env", "team", "opponents", "stats_window_size", "tensorboard_log", "verbose", "seed", "device")
@@ -122,9 +119,6 @@ class CoTraining(JointAlgorithm):
             verbose=verbose,
             device=device,
             seed=seed,
-            sde_support=False,
-            supported_action_spaces=(spaces.Box, spaces.MultiDiscrete),
-            support_multi_env=True,
         )
         require_players(teams or {}, EXAMPLE)
         self.teams = {team: _settings_of(given) for team, given in (teams or {}).items()}
@@ -133,10 +127,6 @@ class CoTraining(JointAlgorithm):
         self.pool_freq = pool_freq
         self.pool_size = pool_size
         self.pool_sampling = pool_sampling
-        self._episode_metrics: deque[dict[str, float]] = deque(maxlen=stats_window_size)
-        self.world_facts: dict[str, float] = {} if self.env is None else facts_of(self.env)  # for scripted opponents
-        if self.env is not None:
-            self.layout = layout_of(self.env)
         if _init_setup_model:
             self._setup_model()
 
@@ -262,18 +252,7 @@ class CoTraining(JointAlgorithm):
             require_finite_columns("action", action, self.columns_of(self.layout.action_slices))
         return action, buffer_action
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        if not dones.any():
-            return
+    def episodes_ended(self, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         ended = np.flatnonzero(dones)
         for learner in self.learners.values():
             if isinstance(learner.action_noise, VectorizedActionNoise):

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -19,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_kfcv.common.checks import require_finite_columns
 from sb3_kfcv.common.patient_logs import patience
 from sb3_kfcv.saving.saveable import SaveableAlgorithm
-from sb3_kfcv.vec_env.make import layout_of, wrap_env
+from sb3_kfcv.vec_env.make import facts_of, layout_of, wrap_env
 
 SelfJoint = TypeVar("SelfJoint", bound="JointAlgorithm")
 
@@ -31,9 +32,23 @@ class JointAlgorithm(SaveableAlgorithm):
     """
     An off-policy algorithm whose env is a joint world: PettingZoo envs are wrapped, transitions are checked before anything
     learns from them, and the worlds' metrics are logged beside SB3's series.
+
+    :param args: as of SB3's ``OffPolicyAlgorithm``
+    :param kwargs: likewise
     """
 
-    _episode_metrics: deque[dict[str, float]]
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(
+            *args,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box, spaces.MultiDiscrete),
+            support_multi_env=True,
+            **kwargs,
+        )
+        self._episode_metrics: deque[dict[str, float]] = deque(maxlen=self._stats_window_size)
+        self.world_facts: dict[str, float] = {} if self.env is None else facts_of(self.env)  # for scripted opponents
+        if self.env is not None:
+            self.layout = layout_of(self.env)
 
     def check_settings(self) -> None:
         """
@@ -120,6 +135,16 @@ class JointAlgorithm(SaveableAlgorithm):
         else:  # the same without a copy of all observations, in which the last ones of ended episodes would be put
             replay_buffer.add(self._last_obs, new_obs, buffer_action, reward, dones, infos)  # type: ignore[arg-type]
             self._last_original_obs, self._last_obs = self._last_obs, new_obs  # type: ignore[assignment]
+        if dones.any():
+            self.episodes_ended(dones, infos)
+
+    def episodes_ended(self, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
+        """
+        Called when episodes have ended and their last transitions are stored.
+
+        :param dones: bool (worlds,): where
+        :param infos: of all worlds
+        """
 
     def columns_of(self, slices: Sequence[slice]) -> dict[str, slice]:
         """Slices of the agents by their names."""

@@ -2,14 +2,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Collection, Mapping
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise, NormalActionNoise
 from stable_baselines3.common.policies import BasePolicy
@@ -38,7 +36,6 @@ from sb3_kfcv.replay import JointReplayBuffer, JointReplayBufferSamples
 from sb3_kfcv.saving.attributes import RETIRED_SETTINGS
 from sb3_kfcv.saving.values import UnwritableError
 from sb3_kfcv.teams.team_policy import LineUp, TeamPolicy
-from sb3_kfcv.vec_env.make import facts_of, layout_of
 
 
 class MADDPG(JointAlgorithm):
@@ -161,9 +158,6 @@ class MADDPG(JointAlgorithm):
             verbose=verbose,
             device=device,
             seed=seed,
-            sde_support=False,
-            supported_action_spaces=(spaces.Box, spaces.MultiDiscrete),
-            support_multi_env=True,
         )
         self.exploration_noise = exploration_noise
         self.critic_input = critic_input
@@ -177,11 +171,6 @@ class MADDPG(JointAlgorithm):
         self.reward_scale = reward_scale
         self.actor_regularization = actor_regularization
         self.gumbel_temperature = gumbel_temperature
-        self._episode_metrics: deque[dict[str, float]] = deque(maxlen=stats_window_size)
-        self.world_facts: dict[str, float] = {} if self.env is None else facts_of(self.env)  # for scripted opponents
-        if self.env is not None:
-            self.layout = layout_of(self.env)
-
         if _init_setup_model:
             self._setup_model()
 
@@ -494,16 +483,7 @@ class MADDPG(JointAlgorithm):
         scaled = self.policy.scale_action(action)
         return scaled if action_noise is None else np.clip(scaled + OneDraw(action_noise)(), -1, 1)
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+    def episodes_ended(self, dones: np.ndarray, infos: list[dict[str, Any]]) -> None:
         if self._opponent_policy is not None:
             self._line_up = self._opponent_policy.line_up(len(dones), self._line_up, dones)
 
