@@ -38,7 +38,7 @@ class JointAlgorithm(SaveableAlgorithm):
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(
+        super().__init__(  # type: ignore[misc]
             *args,
             sde_support=False,
             supported_action_spaces=(spaces.Box, spaces.MultiDiscrete),
