@@ -23,7 +23,9 @@ from sb3_kfcv.vec_env.named_wrappers import NamedWrapper, find_wrappers, listed_
 from zoo.run_folder import read_map
 from zoo.typed_settings import checked, resolve_classes, settings_of
 
-HYPERPARAMS = Path(__file__).parents[1] / "hyperparams"
+# Installed, they lie within the zoo (see setup.py); in a clone, beside it.
+INSTALLED = Path(__file__).with_name("presets")
+HYPERPARAMS = INSTALLED if INSTALLED.is_dir() else Path(__file__).parents[1] / "hyperparams"
 PRESETS = ("default", "tuned")
 
 # Several teams, each with an algorithm of its own.

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import glob
 import re
-import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -31,24 +30,33 @@ from sb3_kfcv.saving.archive import FileFormatError, library_versions
 from sb3_kfcv.saving.files import is_path
 from sb3_kfcv.teams.players import scripted_for
 from sb3_kfcv.vec_env.make import make_vec_env
+from zoo.command_line import PAIRS, REFUSALS, SEVERAL, Parser, as_it_was_typed, refused, start, whole_number
 from zoo.hyperparams import check_env_kwargs, parse_pairs
 from zoo.match_results import Curve, Ratings, as_text, described, shown, table_lines, write_curves, write_table
 from zoo.run_folder import RunFolder, file_to_play
-from zoo.train import BAD_INPUT, REFUSALS, SIGNALLED, Parser, as_typed, whole_number
+from zoo.runs import natural
+
+DESCRIPTION = """\
+Play everybody of one group against everybody of another: saved models of any algorithm, checkpoints, runs, and scripted
+policies. Pay-off tables, win rates with intervals, Elo and equilibrium ratings go to the screen and into a folder. The same
+command gives the same numbers to the bit."""
+EXAMPLES = (
+    "--env Grassland-v0 -n 200",
+    "--team wolf=logs/kfcv_maddpg/Grassland-v0_1 wolf=chase --team sheep=graze sheep=flee",
+    "--curve logs/kfcv_maddpg/Grassland-v0_1 --against sheep=graze",
+)
 
 RANDOM = "random"  # plays the groups that no row and no column is for
 
 
 def make_parser() -> Parser:
     """The command line."""
-    parser = Parser(description="Play everybody of one group against everybody of another.", allow_abbrev=False)
+    parser = Parser("match", DESCRIPTION, EXAMPLES)
     add = parser.add_argument
     add("--env", default="Grassland-v0", help="id of the world (default: %(default)s)")
     add(
         "--team",
-        nargs="+",
-        action="extend",
-        default=[],
+        **SEVERAL,
         metavar="GROUP=PLAYER",
         help="who plays a group: a scripted policy, a file, a run folder, or a quoted pattern of paths, such as wolf=chase "
         "sheep=logs/maddpg/Grassland-v0_1 (default: every scripted policy). The group named first makes the rows",
@@ -61,7 +69,7 @@ def make_parser() -> Parser:
         "--curve", action="append", default=[], metavar="RUN_DIR", help="measure a run over its training, too; may be repeated"
     )
     add("--against", metavar="GROUP=PLAYER", help="the opponent of --curve")
-    add("--env-kwargs", nargs="+", action="extend", default=[], metavar="KEY:VALUE", help="settings of the world")
+    add("--env-kwargs", **PAIRS, help="settings of the world")
     add("--n-envs", type=int, default=64, help="worlds side by side, for speed alone (default: %(default)s)")
     add("--num-threads", type=int, default=1, help="threads of PyTorch (default: %(default)s)")
     add("-o", "--output", default="match", help="folder of the results (default: %(default)s)")
@@ -134,7 +142,7 @@ def found(player: str, group: str, best: bool = False) -> list[str]:
         return [",".join(one for part in player.split(",") for one in found(part, group, best))]
     paths = [player]
     if glob.has_magic(player):
-        paths = sorted(glob.glob(player), key=_natural)
+        paths = sorted(glob.glob(player), key=natural)
         if not paths:
             raise ValueError(f'no file and no folder matches "{player}"')
     return [str(file_to_play(path, group if best else None)) if is_path(path) else path for path in paths]
@@ -173,11 +181,6 @@ def side(arena: Arena, group: str, player: str) -> Side:
     :param player: as :func:`found` gave it
     """
     return arena.side(group, player.split(",") if "," in player else player)
-
-
-def _natural(path: str) -> list[tuple[int, str]]:
-    """Sorts ``model_9`` before ``model_10``."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path)]
 
 
 def label_of(player: str) -> str:
@@ -314,20 +317,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     :param argv: the command line; by default that of the process
     :return: exit status: 0, or 2 for bad input
     """
-    words = [as_typed(Path(sys.executable)), as_typed(Path(__file__).resolve()), *(sys.argv[1:] if argv is None else argv)]
     try:
         args = make_parser().parse_all(argv)
         matches = build(args)
         folder = Path(args.output)
         folder.mkdir(parents=True, exist_ok=True)
     except REFUSALS as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return refused(error)
     except OSError as error:
-        print(f"error: the results cannot be written to {args.output}: {error.strerror}", file=sys.stderr)
-        return BAD_INPUT
+        return refused(OSError(f"the results cannot be written to {args.output}: {error.strerror}"))
     about = {
-        "command": shlex.join(words),
+        "command": as_it_was_typed("match", argv),
         "env": args.env,
         "env_kwargs": parse_pairs("--env-kwargs", args.env_kwargs),
         "seed": args.seed,
@@ -368,8 +368,4 @@ def make_curves(matches: Matches, about: Mapping[str, Any], folder: Path) -> Non
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        print("interrupted; nothing was written of what was not finished", file=sys.stderr)
-        sys.exit(SIGNALLED + 2)
+    start(main, "interrupted; nothing was written of what was not finished")

@@ -14,9 +14,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch as th
 import yaml
@@ -30,7 +29,6 @@ from sb3_kfcv import CoTraining
 from sb3_kfcv.common.callbacks import MultiAgentEvalCallback, SavePlayers, StopOnSignal
 from sb3_kfcv.common.checks import NonFiniteError
 from sb3_kfcv.common.layout import AgentLayout
-from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.patient_logs import PatientResultsWriter
 from sb3_kfcv.maddpg import MADDPG
 from sb3_kfcv.saving import FileFormatError
@@ -40,6 +38,20 @@ from sb3_kfcv.saving.saveable import refusals
 from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import facts_of, layout_of, make_vec_env, metric_names_of
 from sb3_kfcv.vec_env.named_wrappers import find_wrappers
+from zoo.command_line import (
+    BAD_INPUT,
+    PAIRS,
+    REFUSALS,
+    SEVERAL,
+    SIGNALLED,
+    Parser,
+    as_it_was_typed,
+    device,
+    refused,
+    start,
+    this_command,
+    whole_number,
+)
 from zoo.hyperparams import (
     ALGORITHMS,
     CO_TRAINING,
@@ -58,13 +70,20 @@ from zoo.run_folder import RunFolder, file_name, file_to_play, read_map
 from zoo.teams import Teams, Yardstick, parse_teams, with_teams, yardsticks
 from zoo.typed_settings import settings_of
 
-BAD_INPUT = 2  # exit status, as of argparse
+# Exit statuses beside those of every command.
 NOT_FINITE = 3  # a loss, reward, observation or action was infinite or NaN
 NOT_WRITTEN = 4  # the training came to its end, but its model could not be written
-SIGNALLED = 128  # plus the number of the signal: 130 after Ctrl-C, 143 after SIGTERM
 
-# What is wrong before the training begins is told in one sentence.
-REFUSALS = (ValueError, MemoryError, gym.error.Error)
+DESCRIPTION = """\
+Train an algorithm in a world. Hyperparameters come from hyperparams/<algo>.yml, its preset and the command line, the later
+ones winning. All that a run makes lies in <log folder>/<algo>/<env>_<k>: models, checkpoints, evaluations, TensorBoard, the
+settings. A run that was stopped or killed goes on with --resume."""
+EXAMPLES = (
+    "--env Grassland-v0 --preset tuned -n 1e5 -P",
+    "--algo maddpg --env HardSpread-v0 -params gamma:0.95 --env-kwargs n_agents:2 walls:none",
+    "--team wolf=kfcv_maddpg sheep=graze --preset tuned -n 1e5",
+    "--resume logs/kfcv_maddpg/Grassland-v0_1",
+)
 
 # Worlds of the evaluation are seeded this far above those of the training, which are seed, seed + 1, …
 EVAL_SEED_OFFSET = 1_000_000
@@ -82,25 +101,9 @@ PLAYER_FREQ = 25_000
 FREE_WHEN_RESUMED = ("resume", "progress", "verbose")
 
 
-class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one sentence, by an exception."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(message)
-
-    def parse_all(self, argv: Sequence[str] | None) -> argparse.Namespace:
-        """
-        :raises ValueError: for bad usage; for an unknown flag, with the nearest one
-        """
-        args, unknown = self.parse_known_args(argv)
-        if unknown:
-            raise ValueError(unknown_name("flag", unknown[0], [*self._option_string_actions]))
-        return args
-
-
 def make_parser() -> Parser:
     """The command line."""
-    parser = Parser(description="Train multi-agent algorithms.", allow_abbrev=False)
+    parser = Parser("train", DESCRIPTION, EXAMPLES)
     add = parser.add_argument
     add("--algo", default="kfcv_maddpg", help=f"{', '.join(ALGORITHMS)}; default: %(default)s")
     add("--env", default="Grassland-v0", help="id of the world (default: %(default)s)")
@@ -133,25 +136,25 @@ def make_parser() -> Parser:
     add("--keep-checkpoints", type=int, default=3, help="how many of the latest are kept, -1: all (default: %(default)s)")
     add("--save-replay-buffer", action="store_true", help="save the replay buffer at the end, for -i")
     add("--log-interval", type=int, default=-1, help=f"episodes between logs; -1: {EPISODES_PER_LOG} per world, -2: off")
-    pairs: dict[str, Any] = {"nargs": "+", "action": "extend", "default": [], "metavar": "KEY:VALUE"}
-    add("-params", "--hyperparams", **pairs, help="overwrite hyperparameters, such as gamma:0.95 policy_kwargs.n_critics:2")
-    add("--env-kwargs", **pairs, help="settings of the world, such as n_wolves:4")
+    add("-params", "--hyperparams", **PAIRS, help="overwrite hyperparameters, such as gamma:0.95 policy_kwargs.n_critics:2")
+    add("--env-kwargs", **PAIRS, help="settings of the world, such as n_wolves:4")
     add("--vec-env", choices=("dummy", "subproc"), default="dummy", help="subproc: each world in a process of its own")
-    add("--eval-env-kwargs", **pairs, help="settings of the evaluation's worlds where they differ")
+    add("--eval-env-kwargs", **PAIRS, help="settings of the evaluation's worlds where they differ")
     add("-conf", "--conf-file", help="YAML file of hyperparameters (default: hyperparams/<algo>.yml)")
     add("--preset", help=f"{' or '.join(PRESETS)}: what learns better in place of the paper's values")
     add("-i", "--trained-agent", help="a saved model to train on in a new run, with the replay_buffer.zip beside it if any")
-    teams: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
     add(
         "--team",
-        **{**teams, "metavar": "GROUP=WHO"},
+        **SEVERAL,
+        metavar="GROUP=WHO",
         help="who learns a group (wolf=kfcv_maddpg) or plays it (sheep=graze, sheep=MODEL.zip, a mixture sheep=graze,flee);"
         " several that learn train at once, against each other",
     )
-    add("--opponents", **{**pairs, "metavar": "GROUP:NAME"}, help="the same as GROUP=NAME after --team")
+    add("--opponents", **{**PAIRS, "metavar": "GROUP:NAME"}, help="the same as GROUP=NAME after --team")
     add(
         "--yardstick",
-        **{**teams, "metavar": "GROUP=WHO"},
+        **SEVERAL,
+        metavar="GROUP=WHO",
         help="fixed opponents that evaluations are against, beside those of the training "
         "(default: the scripted policies, where teams learn against each other)",
     )
@@ -164,25 +167,6 @@ def make_parser() -> Parser:
     add("--device", type=device, default="auto", help="auto, cpu, cuda (default: %(default)s)")
     add("--verbose", type=int, default=1, help="0: quiet, 1: info (default: %(default)s)")
     return parser
-
-
-def whole_number(text: str) -> int:
-    """A whole number, also as ``1e6``."""
-    try:
-        number = float(text)
-        if number == int(number):
-            return int(number)
-    except (ValueError, OverflowError):
-        pass
-    raise argparse.ArgumentTypeError(f'"{text}" is no whole number')
-
-
-def device(text: str) -> str:
-    """The name of a PyTorch device, or ``auto``."""
-    try:
-        return text if text == "auto" else str(th.device(text))
-    except RuntimeError:
-        raise argparse.ArgumentTypeError(f'"{text}" is no device; give auto, cpu or cuda') from None
 
 
 @dataclass
@@ -603,8 +587,7 @@ def train(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseC
         except KeyboardInterrupt:
             return SIGNALLED + (stop.received or StopOnSignal.SIGNALS[0])
         except (ResumeError, FileFormatError) as error:
-            print(f"error: {error}", file=sys.stderr)
-            return BAD_INPUT
+            return refused(error)
         except NonFiniteError as error:
             print(f"error: {error}; the training has stopped after {model.num_timesteps:,} env steps", file=sys.stderr)
             return NOT_FINITE
@@ -621,26 +604,16 @@ def train(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseC
     return 0
 
 
-def as_typed(path: Path) -> str:
-    """A path from the working directory, where it lies below it."""
-    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
-
-
-def this_script() -> list[str]:
-    """This Python and this script, as one types them."""
-    return [as_typed(Path(sys.executable)), as_typed(Path(__file__).resolve())]
-
-
 def what_is_left(training: Training, folder: RunFolder, status: int) -> str:
     """What a run that did not come to its end leaves behind, and how it goes on."""
     checkpoints = checkpoints_in(folder.path)
-    resume = shlex.join([*this_script(), "--resume", str(folder.path)])
+    resume = shlex.join([*this_command("train"), "--resume", str(folder.path)])
     if not checkpoints:
         return f"no checkpoint was saved yet; to start again: {resume}"
     steps, path = next(iter(checkpoints.items()))
     if status == NOT_FINITE:  # the same would come again
         of = ["--algo", training.args.algo, "--env", training.args.env]
-        other = shlex.join([*this_script(), *of, "-i", str(path), "-n", "STEPS", "-params", "NAME:VALUE"])
+        other = shlex.join([*this_command("train"), *of, "-i", str(path), "-n", "STEPS", "-params", "NAME:VALUE"])
         return f"the last checkpoint is of {steps:,} env steps; to train it on with other settings: {other}"
     return f"the last checkpoint is of {steps:,} env steps; to go on: {resume}"
 
@@ -654,18 +627,16 @@ def main(argv: Sequence[str] | None = None, extra_callbacks: Sequence[BaseCallba
     :return: exit status: 0; 2 for bad input; 3 for a number that is not finite; 4 if the model could not be written at the
         end; 130 after Ctrl-C, 143 after SIGTERM
     """
-    words = [*this_script(), *(sys.argv[1:] if argv is None else argv)]
     try:
         args = make_parser().parse_all(argv)
         training = build(args) if args.resume is None else None
     except REFUSALS as error:
-        print(f"error: {error}", file=sys.stderr)
-        return BAD_INPUT
+        return refused(error)
     if training is None:
         return resume_run(args, extra_callbacks)
     try:
         folder = RunFolder.create(args.log_folder, args.algo, args.env)
-        folder.describe(training.hyperparams.to_dict(), vars(args), shlex.join(words))
+        folder.describe(training.hyperparams.to_dict(), vars(args), as_it_was_typed("train", argv))
     except OSError as error:
         print(f"error: the run cannot write its files: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -694,8 +665,7 @@ def resume_run(args: argparse.Namespace, extra_callbacks: Sequence[BaseCallback]
             then = Opponents.of(latest_checkpoint(folder.path))  # which sets aside what is damaged
             training = build(begun, folder, then)
         except REFUSALS as error:
-            print(f"error: {error}", file=sys.stderr)
-            return BAD_INPUT
+            return refused(error)
         if changed:
             print(f"note: {', '.join(changed)} since the run was begun: perhaps not bit for bit", file=sys.stderr)
         print(f"{begun.algo} on {begun.env}, seed {begun.seed}, goes on in {folder.path}")
@@ -716,8 +686,4 @@ def run(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseCal
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        print("interrupted before the training began", file=sys.stderr)
-        sys.exit(SIGNALLED + StopOnSignal.SIGNALS[0])
+    start(main, "interrupted before the training began")

@@ -1,0 +1,143 @@
+"""Which runs there are: found by their folders, by patterns, or as the latest of an algorithm in a world."""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from sb3_kfcv.common.naming import unknown_name
+from zoo.hyperparams import Hyperparams, check
+from zoo.run_folder import RunFolder, read_map
+
+# How deep below a folder runs may lie: <sweep>/<cell>/<algo>/<env>_<k>.
+DEPTH = 5
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    A training run, as it was begun.
+
+    :param folder: where it lies
+    """
+
+    folder: RunFolder
+
+    @classmethod
+    def at(cls, path: str | Path) -> Run:
+        """
+        The run in a folder.
+
+        :raises ValueError: if there is none
+        """
+        return cls(RunFolder.existing(path))
+
+    @cached_property
+    def args(self) -> dict[str, Any]:
+        """The command line, resolved."""
+        return read_map(self.folder.arguments_file)
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """The settings, resolved, as :attr:`RunFolder.config_file` holds them."""
+        return read_map(self.folder.config_file)
+
+    @property
+    def hyperparams(self) -> Hyperparams:
+        """
+        The settings, checked.
+
+        :raises ValueError: if they are none of this version
+        """
+        return check(self.algo, self.env_id, self.config)
+
+    @property
+    def algo(self) -> str:
+        return self.args["algo"]
+
+    @property
+    def env_id(self) -> str:
+        return self.folder.env_id
+
+    @property
+    def seed(self) -> int:
+        return self.args["seed"]
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether it came to its end."""
+        return self.folder.last_model.is_file()
+
+    @property
+    def begun(self) -> float:
+        """When, in seconds since 1970."""
+        return self.folder.arguments_file.stat().st_mtime
+
+
+def runs_below(path: str | Path) -> list[Run]:
+    """
+    The runs in a folder: the folder itself if it is one, else all that lie in it, such as in a log folder or in a sweep, in
+    the natural order of their paths.
+    """
+    path = Path(path)
+    if list(path.glob("*/args.yml")):
+        return [Run.at(path)]
+    found = {file.parent.parent for depth in range(2, DEPTH + 1) for file in path.glob("*/" * depth + "args.yml")}
+    return [Run.at(folder) for folder in sorted(found, key=lambda folder: natural(str(folder)))]
+
+
+def find_runs(words: Iterable[str]) -> list[Run]:
+    """
+    The runs that words of a command line mean, each once.
+
+    :param words: run folders, folders over them, and patterns of either
+    :raises ValueError: for a word that means none
+    """
+    runs: dict[Path, Run] = {}
+    for word in words:
+        paths = sorted(glob.glob(word), key=natural) if glob.has_magic(word) else [word]
+        found = [run for path in paths for run in runs_below(path)]
+        if not found:
+            raise ValueError(f"there is no run of zoo/train.py in {word}")
+        runs.update((run.folder.path.resolve(), run) for run in found)
+    return list(runs.values())
+
+
+def pick_run(log_folder: str | Path, algo: str | None = None, env_id: str | None = None, exp_id: int = 0) -> Run:
+    """
+    A run of a log folder.
+
+    :param log_folder: where runs lie
+    :param algo: only of this algorithm
+    :param env_id: only in this world
+    :param exp_id: its number (the k of ``<env>_<k>``); 0 takes the one that was begun last
+    :raises ValueError: if there is none, with what there is
+    """
+    runs = runs_below(log_folder)
+    if not runs:
+        raise ValueError(f"there is no run in {log_folder}; train one with zoo/train.py, or say with -f where runs lie")
+    _require("algorithm", algo, [run.algo for run in runs])
+    _require("environment", env_id, [run.env_id for run in runs])
+    fitting = [run for run in runs if algo in (None, run.algo) and env_id in (None, run.env_id)]
+    numbered = [run for run in fitting if exp_id in (0, run.folder.number)]
+    if not numbered:
+        raise ValueError(
+            f"no run in {log_folder} fits; there are {', '.join(str(run.folder.path) for run in fitting or runs)}"
+        )
+    return max(numbered, key=lambda run: run.begun)
+
+
+def natural(text: str) -> list[tuple[int, str]]:
+    """A key by which ``model_9`` comes before ``model_10``."""
+    parts: Sequence[str] = re.split(r"(\d+)", text)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+
+def _require(kind: str, name: str | None, known: Sequence[str]) -> None:
+    if name is not None and name not in known:
+        raise ValueError(f"there is no run of it: {unknown_name(kind, name, set(known))}")
