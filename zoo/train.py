@@ -20,7 +20,7 @@ import numpy as np
 import torch as th
 import yaml
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import KVWriter, configure
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor, VecNormalize
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import each other as the package ``zoo``
@@ -68,6 +68,7 @@ from zoo.hyperparams import (
 )
 from zoo.run_folder import RunFolder, file_name, file_to_play, read_map
 from zoo.teams import Teams, Yardstick, parse_teams, with_teams, yardsticks
+from zoo.tracking import HyperparamsPage, prepare_tracking, tracked
 from zoo.typed_settings import settings_of
 
 # Exit statuses beside those of every command.
@@ -163,6 +164,11 @@ def make_parser() -> Parser:
         type=whole_number,
         help="env steps between the players saved for matches, -1: none (default: 25000 with --team, else none)",
     )
+    add("--track", action="store_true", help="follow the run with Weights & Biases; WANDB_MODE=offline keeps the records here")
+    add("--wandb-project-name", default="sb3-kfcv", help="project there (default: %(default)s)")
+    add("--wandb-entity", help="team or user there (default: your own)")
+    add("-tags", "--wandb-tags", **SEVERAL, metavar="TAG", help="tags of the run there")
+    add("--run-name", help="its name there (default: <algo>/<env>_<k>)")
     add("--num-threads", type=int, default=1, help="threads of PyTorch (default: %(default)s)")
     add("--device", type=device, default="auto", help="auto, cpu, cuda (default: %(default)s)")
     add("--verbose", type=int, default=1, help="0: quiet, 1: info (default: %(default)s)")
@@ -455,6 +461,8 @@ def build(args: argparse.Namespace, resumed: RunFolder | None = None, then: Oppo
         raise ValueError("--keep-checkpoints is 0; it must be at least 1, or -1 to keep all")
     if args.player_freq is not None and args.player_freq < 1 and args.player_freq != -1:
         raise ValueError(f"--player-freq is {args.player_freq}; it must be at least 1, or -1")
+    if resumed is None:
+        prepare_tracking(args, make_parser().parse_all([]))
     hyperparams = check(args.algo, args.env, read_map(resumed.config_file)) if resumed else resolve(args)
     then = then or Opponents()
     th.set_num_threads(args.num_threads)
@@ -498,6 +506,7 @@ def make_callbacks(training: Training, folder: RunFolder, stop: StopOnSignal) ->
     callbacks: list[BaseCallback] = [
         stop,
         Checkpoints(folder.path, args.save_freq, args.keep_checkpoints, resume, stop, verbose=args.verbose),
+        HyperparamsPage({"algo": args.algo, "env": args.env, "seed": args.seed, **training.hyperparams.to_dict()}),
     ]
     if training.eval_env is not None:
         callbacks.append(
@@ -534,8 +543,14 @@ def is_first_of_its_team(yardstick: Yardstick, all_of_them: Sequence[Yardstick])
     return next(other for other in all_of_them if other.team == yardstick.team) is yardstick
 
 
-def start_logs(training: Training, folder: RunFolder) -> None:
-    """Open the run's logs: the monitor file, TensorBoard, the screen."""
+def start_logs(training: Training, folder: RunFolder, further: Sequence[KVWriter] = ()) -> None:
+    """
+    Open the run's logs: the monitor file, TensorBoard, the screen.
+
+    :param training: what was built
+    :param folder: of the run
+    :param further: log formats beside these
+    """
     env: Any = training.model.get_env()
     while not isinstance(env, VecMonitor):
         env = env.venv
@@ -554,7 +569,9 @@ def start_logs(training: Training, folder: RunFolder) -> None:
     if args.resume is not None and not going_on:  # it begins again: nothing may stay of what it logged before
         for path in log_path.glob("events.out.tfevents.*"):
             path.unlink()
-    training.model.set_logger(configure(str(log_path), formats))
+    logger = configure(str(log_path), formats)
+    logger.output_formats += further
+    training.model.set_logger(logger)
 
 
 def log_interval(args: argparse.Namespace, n_envs: int) -> int | None:
@@ -674,12 +691,15 @@ def resume_run(args: argparse.Namespace, extra_callbacks: Sequence[BaseCallback]
 
 def run(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseCallback]) -> int:
     """Train, and say what is left if that did not come to its end."""
-    try:
-        start_logs(training, folder)
-    except OSError as error:
-        print(f"error: the run cannot write its logs: {error}", file=sys.stderr)
-        return BAD_INPUT
-    status = train(training, folder, extra_callbacks)
+    with ExitStack() as stack:
+        try:
+            writers = stack.enter_context(tracked(training.args, folder, training.hyperparams.to_dict()))
+            start_logs(training, folder, writers)
+        except ValueError as error:
+            return refused(error)
+        except OSError as error:
+            return refused(OSError(f"the run cannot write its logs: {error}"))
+        status = train(training, folder, extra_callbacks)
     if status:
         print(f"stopped: {what_is_left(training, folder, status)}")
     return status
