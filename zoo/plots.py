@@ -26,17 +26,25 @@ HEAT_MAP = "cividis"  # reads the same with every kind of colour vision
 DPI = 150
 
 
-def new_figure(n_panels: int, title: str | None = None, size: tuple[float, float] = (5.2, 3.8)) -> tuple[Figure, list[Axes]]:
+def new_figure(
+    n_panels: int, title: str | None = None, size: tuple[float, float] = (5.2, 3.8), columns: int | None = None
+) -> tuple[Figure, list[Axes]]:
     """
-    A figure with panels side by side.
+    A figure with panels.
 
     :param n_panels: how many
     :param title: over all of them
     :param size: width and height of each, in inches
+    :param columns: so many side by side; by default all
     """
-    figure = Figure(figsize=(size[0] * n_panels, size[1]), layout="constrained")
+    columns = min(columns or n_panels, n_panels)
+    rows = -(-n_panels // columns)
+    figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = list(figure.subplots(1, n_panels, squeeze=False)[0])
+    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for spare in panels[n_panels:]:
+        spare.remove()
+    axes = panels[:n_panels]
     for axis in axes:
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
