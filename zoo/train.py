@@ -444,13 +444,19 @@ class Opponents:
             return cls(dict(checkpoint.attributes.get("opponents") or {}), measured)
 
 
-def build(args: argparse.Namespace, resumed: RunFolder | None = None, then: Opponents | None = None) -> Training:
+def build(
+    args: argparse.Namespace,
+    resumed: RunFolder | None = None,
+    then: Opponents | None = None,
+    hyperparams: Hyperparams | None = None,
+) -> Training:
     """
     Everything that can be refused, before anything is written.
 
     :param args: the command line
     :param resumed: the folder of the run, if it goes on
     :param then: who has played in it
+    :param hyperparams: the settings, where the command line does not tell them
     :raises ValueError: one sentence that says what is wrong
     """
     if args.num_threads < 1:
@@ -463,7 +469,8 @@ def build(args: argparse.Namespace, resumed: RunFolder | None = None, then: Oppo
         raise ValueError(f"--player-freq is {args.player_freq}; it must be at least 1, or -1")
     if resumed is None:
         prepare_tracking(args, make_parser().parse_all([]))
-    hyperparams = check(args.algo, args.env, read_map(resumed.config_file)) if resumed else resolve(args)
+    if hyperparams is None:
+        hyperparams = check(args.algo, args.env, read_map(resumed.config_file)) if resumed else resolve(args)
     then = then or Opponents()
     th.set_num_threads(args.num_threads)
     if args.seed < 0:
