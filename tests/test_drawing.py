@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sb3_kfcv.envs.drawing import PALETTE, Disc, Rectangle, Scene, draw, pixel_of, save_gif
+from sb3_kfcv.envs.drawing import PALETTE, Disc, Rectangle, Scene, draw, pixel_of, save_gif, without_caption_strip
 
 SIZE = 300
 
@@ -103,3 +103,12 @@ def test_gif_refuses_nothing_and_no_speed(tmp_path):
         save_gif([], tmp_path / "run.gif")
     with pytest.raises(ValueError, match="fps must be positive"):
         save_gif([draw(Scene(1.0, []), 80)], tmp_path / "run.gif", fps=0)
+
+
+def test_the_plane_without_the_caption_above_it():
+    picture = without_caption_strip(draw(Scene(1.0, []), SIZE))
+    not_paper = (picture < 255).any(axis=-1)
+    rows, columns = np.flatnonzero(not_paper.any(axis=1)), np.flatnonzero(not_paper.any(axis=0))
+    above, below = rows[0], len(picture) - 1 - rows[-1]
+    assert above == pytest.approx(below, abs=1)
+    assert len(rows) == pytest.approx(len(columns), abs=1)

@@ -398,3 +398,40 @@ def test_every_episode_and_every_group_draws_its_own_numbers():
     arena.play({group: Spy(arena.layout, group) for group in drawn}, BLOCK)
     first = np.concatenate([drawn["wolf"][0], drawn["sheep"][0]])
     assert len(np.unique(first, axis=0)) == 2 * BLOCK
+
+
+def test_whoever_sees_the_states_sees_those_of_its_own_world():
+    """The oracle, whatever worlds step beside, and beside blocks of rows that have no world."""
+
+    def played(n_envs):
+        env = make_vec_env("HardSpread-v0", n_envs, env_kwargs={"max_steps": 12})
+        return Arena(env).play({"agent": "oracle"}, 5, seed=30).quantities()
+
+    alone = [
+        evaluate(TeamPolicy(layout_of(env), {"agent": "oracle"}, state_source=env.get_attr("worlds")[0].states), env, 1)
+        for env in (make_vec_env("HardSpread-v0", 1, seed, {"max_steps": 12}) for seed in range(30, 35))
+    ]
+    for n_envs in (1, 5):
+        own = played(n_envs)
+        for name in ("return_agent", "cover_rate"):
+            np.testing.assert_allclose(own[name], [episode[name][0] for episode in alone], rtol=1e-6, err_msg=name)
+    assert_same(played(1), played(5))
+
+
+def test_agents_that_choose_draw_only_where_they_are_not_to_be_greedy():
+    env = make_vec_env("HardSpread-v0", 4, env_kwargs={"max_steps": 12, "continuous_actions": False})
+    model, arena = MADDPG("MlpPolicy", env, **TINY), Arena(env)
+    greedy = [arena.play({"agent": model}, 4).quantities() for _ in range(2)]
+    assert_same(*greedy)
+    drawn = [arena.play({"agent": model}, 4, deterministic=False).returns["agent"] for _ in range(2)]
+    assert not np.array_equal(drawn[0], drawn[1])
+    assert not np.array_equal(drawn[0], greedy[0]["return_agent"])
+
+
+def test_who_watches_hears_of_every_reset_and_step():
+    heard = []
+    played = small_arena(2).play(
+        {"wolf": "chase", "sheep": "graze"}, 3, watch=lambda dones, infos: heard.append((len(dones), len(infos)))
+    )
+    steps = [max(played.lengths[:2]), played.lengths[2]]
+    assert heard == [entry for n in steps for entry in [(2, 0), *[(2, 2)] * n]]

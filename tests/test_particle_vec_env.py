@@ -187,3 +187,14 @@ def test_works_under_monitor_normalisation_and_evaluation():
     returns, lengths = evaluate_policy(Still(), wrapped, n_eval_episodes=6, return_episode_rewards=True)
     assert lengths == [5] * 6
     assert np.isfinite(returns).all()
+
+
+def test_worlds_that_are_drawn_tell_how_they_ended():
+    """Not how they begin again, which is what there is to draw after the step."""
+    venv = hard_spread(render_mode="rgb_array")
+    venv.reset()
+    for _ in range(5):
+        _, _, dones, infos = venv.step(np.ones((3, 8), dtype=np.float32))
+    assert dones.all()
+    assert [info["terminal_scene"].caption.split()[1] for info in infos] == ["5/5"] * 3
+    assert venv.env_method("scene", indices=[0])[0].caption.split()[1] == "0/5"

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pettingzoo
 import pytest
+from matplotlib import pyplot
 from pettingzoo.test import api_test, parallel_api_test, seed_test
 from pettingzoo.test.seed_test import parallel_seed_test
 from pettingzoo.test.state_test import state_test
@@ -12,6 +13,7 @@ from pettingzoo.utils.conversions import parallel_to_aec
 from stable_baselines3 import PPO
 
 from sb3_kfcv.envs import grassland_v0, hard_spread_v0, register
+from sb3_kfcv.envs.parallel_env import Window
 
 SMALL_GRASSLAND = {"n_wolves": 3, "n_sheep": 2, "n_obstacles": 1}
 VARIANTS = [
@@ -183,3 +185,12 @@ def test_ids_are_registered_once(env_id):
         register()
         register()
     assert pettingzoo.make("parallel", env_id, max_steps=7).worlds.max_steps == 7
+
+
+def test_a_window_without_a_display_shows_nothing_until_it_is_closed():
+    pyplot.switch_backend("agg")  # also where there is a display
+    window = Window("world", fps=1000.0)
+    assert not window.is_visible and not window.is_closed
+    window.show(np.zeros((4, 4, 3), dtype=np.uint8))
+    window.close()
+    assert window.is_closed

@@ -50,7 +50,7 @@ class Parser(argparse.ArgumentParser):
         """
         :raises ValueError: for bad usage; for an unknown flag, with the nearest one
         """
-        args, unknown = self.parse_known_args(argv)
+        args, unknown = self.parse_known_intermixed_args(argv)
         if unknown:
             raise ValueError(unknown_name("flag", unknown[0], [*self._option_string_actions]))
         return args

@@ -18,12 +18,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import e
 from sb3_kfcv.common.callbacks import TrainByTheClock
 from sb3_kfcv.common.evaluation import evaluate, with_interval
 from sb3_kfcv.common.layout import AgentLayout
+from sb3_kfcv.matches import Arena
 from sb3_kfcv.teams.players import JointModel
 from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env import make_vec_env
 from sb3_kfcv.vec_env.make import layout_of
 from zoo.plots import ALGO_COLOURS, ALGO_LABELS, draw_curve, draw_references, new_figure, save_arrays, save_figure
-from zoo.recording import record, save_gif
+from zoo.recording import film, save_gif
 from zoo.run_folder import RunFolder
 from zoo.train import build, make_parser, start_logs, train
 
@@ -227,8 +228,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     table, results = match_table(training.model, args.episodes, args.seed + TABLE_SEED)
     print(f"\nAll line-ups, {args.episodes} episodes each in the same fresh worlds (±: 95 % interval of the mean):\n\n{table}")
     print(f"\n{verdict(results)}")
-    gif_env = make_vec_env(WORLD, 1, args.seed + GIF_SEED, {"render_mode": "rgb_array"})
-    save_gif(record(training.model, gif_env, 4), folder / "grassland.gif", fps=8)
+    arena = Arena(make_vec_env(WORLD, 4, env_kwargs={"render_mode": "rgb_array"}))
+    players = dict.fromkeys(arena.layout.group_names, training.model)
+    title = f"{WORLD}: {ALGO_LABELS[ALGO]} after {args.minutes:g} minutes; return per agent so far"
+    frames, _ = film(arena, players, [title], args.seed + GIF_SEED)
+    save_gif(frames, folder / "grassland.gif", fps=8)
     print(f"\nLearning curve: {folder / 'learning_curve.png'}\nTrained wolves and sheep: {folder / 'grassland.gif'}")
     print(f"TensorBoard: .venv/bin/tensorboard --logdir {folder}")
     return 0

@@ -111,6 +111,15 @@ def draw(scene: Scene, size: int = 600) -> np.ndarray:
     return np.asarray(image.resize((size, size), Image.Resampling.BOX))
 
 
+def without_caption_strip(picture: np.ndarray) -> np.ndarray:
+    """
+    A picture of a scene that has no caption, without the room for one: the plane with even margins.
+
+    :param picture: as :func:`draw` gives it (size, size, 3)
+    """
+    return picture[round(len(picture) * _CAPTION_HEIGHT) :]
+
+
 def pixel_of(scene: Scene, x: float, y: float, size: int = 600) -> tuple[int, int]:
     """
     Where a point of the world lies in the picture that :func:`draw` makes.

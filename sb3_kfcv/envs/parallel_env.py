@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ class ParticleParallelEnv(ParallelEnv):
         self._obs_slices = [slice(end - size, end) for end, size in zip(ends, worlds.obs_sizes, strict=True)]
         self.agents: list[str] = []
         self.state_space = spaces.Box(-np.inf, np.inf, (worlds.state_size,), np.float32)
-        self._window: _Window | None = None
+        self._window: Window | None = None
 
     def observation_space(self, agent: str) -> spaces.Box:
         return self.worlds.observation_space(agent)
@@ -134,7 +135,7 @@ class ParticleParallelEnv(ParallelEnv):
         if self.render_mode == "rgb_array":
             return picture
         if self._window is None:
-            self._window = _Window(self.metadata["name"], self.worlds.render_fps)
+            self._window = Window(self.metadata["name"], self.worlds.render_fps)
         self._window.show(picture)
         return None
 
@@ -177,7 +178,7 @@ class ParticleParallelEnv(ParallelEnv):
         return joined
 
 
-class _Window:
+class Window:
     """
     A matplotlib window that shows one picture after the other; without a display it shows nothing.
 
@@ -185,22 +186,32 @@ class _Window:
     :param fps: pictures per second
     """
 
-    def __init__(self, title: str, fps: int):
+    def __init__(self, title: str, fps: float):
         import matplotlib.pyplot as plt  # only a window needs it, and it is slow to import
 
         self._plt = plt
         self._pause = 1 / fps
-        self._figure, axes = plt.subplots(num=title, frameon=False)
+        self._next = 0.0  # when the next picture may take the place of the last one
+        self._figure, axes = plt.subplots(num=title, frameon=False, figsize=(6, 6))
+        self._figure.subplots_adjust(0, 0, 1, 1)
         axes.set_axis_off()
         self._image = axes.imshow(np.zeros((1, 1, 3), dtype=np.uint8))
-        self._visible = self._figure.canvas.required_interactive_framework is not None
+        self.is_visible = self._figure.canvas.required_interactive_framework is not None
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether somebody has closed it."""
+        return not self._plt.fignum_exists(self._figure.number)
 
     def show(self, picture: np.ndarray) -> None:
         """Show a picture, uint8 (height, width, 3), and wait for the next one's turn."""
-        if self._visible:
+        if self.is_visible and not self.is_closed:
             height, width, _ = picture.shape
             self._image.set(data=picture, extent=(0, width, height, 0))
-            self._plt.pause(self._pause)
+            left = self._next - time.perf_counter()
+            with self._plt.rc_context({"figure.raise_window": False}):  # it would come to the front at every picture
+                self._plt.pause(max(left, 0.001))
+            self._next = time.perf_counter() + self._pause
 
     def close(self) -> None:
         self._plt.close(self._figure)

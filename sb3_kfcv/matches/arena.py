@@ -24,7 +24,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_kfcv.common.actors import ActorPolicy
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.layout import AgentLayout
-from sb3_kfcv.envs.scripted import ScriptedPolicy
+from sb3_kfcv.envs.scripted import OraclePolicy, ScriptedPolicy
 from sb3_kfcv.saving.archive import open_archive
 from sb3_kfcv.saving.files import existing, is_path
 from sb3_kfcv.teams.players import PLAYER_KINDS, Mixture, RandomPlayer, find_player
@@ -33,6 +33,9 @@ from sb3_kfcv.vec_env.make import facts_of, layout_of, metric_names_of, wins_of
 
 BLOCK = 32
 """Rows that a player sees at once."""
+
+# Hears of every reset and every step: which worlds' episodes are over (worlds,), and their infos, none after a reset.
+Watch = Callable[[np.ndarray, Sequence[dict[str, Any]]], Any]
 
 
 @dataclass(frozen=True)
@@ -112,9 +115,11 @@ class FrozenActors:
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[np.ndarray, None]:
-        """Greedy joint actions for a block of joint rows (``BLOCK``, joint)."""
+        """Joint actions for a block of joint rows (``BLOCK``, joint); discrete agents draw if they are not to be greedy."""
         self._rows.copy_(th.from_numpy(observation))
-        return self.policy.to_env(self.policy.greedy_rows(self._rows)), None
+        with th.no_grad():
+            actions = self.policy.joint_actions(self.policy.actor, self._rows, explore=not deterministic)
+        return self.policy.to_env(actions), None
 
 
 class Side:
@@ -135,6 +140,8 @@ class Side:
             TeamPolicy(layout, {group: self._steady(member)}, groups=(group,))
             for member in (player.players if isinstance(player, Mixture) else [player])
         ]
+        members = [member.players[group] for member in self._members]
+        self.sees_states = any(isinstance(member, OraclePolicy) for member in members)
 
     def line_up(self, generators: Sequence[np.random.Generator]) -> np.ndarray:
         """
@@ -148,7 +155,12 @@ class Side:
         return self.mixture.draw(len(generators), cast(np.random.Generator, self._draws))
 
     def fill(
-        self, actions: np.ndarray, rows: np.ndarray, playing: np.ndarray, generators: Sequence[np.random.Generator]
+        self,
+        actions: np.ndarray,
+        rows: np.ndarray,
+        playing: np.ndarray,
+        generators: Sequence[np.random.Generator],
+        deterministic: bool = True,
     ) -> None:
         """
         Write its actions into a block of joint actions.
@@ -157,11 +169,12 @@ class Side:
         :param rows: joint observations, float32 (``BLOCK``, joint)
         :param playing: as :meth:`line_up` gave it
         :param generators: of the episodes
+        :param deterministic: passed on to the players
         """
         for i in np.unique(playing):
             own = playing == i
             self._draws.seat([rng if mine else self._unheard for rng, mine in zip(generators, own, strict=True)])
-            actions[own] = self._members[i].fill(actions, rows)[own]
+            actions[own] = self._members[i].fill(actions, rows, deterministic)[own]
 
     def _steady(self, player: Any) -> Any:
         """The player, its draws and its arithmetic kept within each episode."""
@@ -186,9 +199,13 @@ class Arena:
     """
 
     def __init__(self, env: VecEnv, **facts: Any) -> None:
-        self.env, self.facts = env, {**facts_of(env), **facts}
+        self.env = env
         self.layout = layout_of(env)
         self.wins = wins_of(env)
+        self._states: np.ndarray | None = None  # of the worlds in the block that is acted on, for players that see them
+        if env.has_attr("state"):
+            facts = {"state_source": lambda: self._states, **facts}
+        self.facts = {**facts_of(env), **facts}
 
     def quantities(self) -> tuple[str, ...]:
         """Names of what is measured in every episode, see :meth:`Episodes.quantities`."""
@@ -225,13 +242,22 @@ class Arena:
         rng = np.random.default_rng()  # gives way to those of the episodes
         return Side(self.layout, group, find_player(given, self.layout, group, rng, self.env.action_space, **self.facts))
 
-    def play(self, players: Mapping[str, Any], n_episodes: int, seed: int = 0) -> Episodes:
+    def play(
+        self,
+        players: Mapping[str, Any],
+        n_episodes: int,
+        seed: int = 0,
+        deterministic: bool = True,
+        watch: Watch = lambda dones, infos: None,
+    ) -> Episodes:
         """
-        Play a match, greedily.
+        Play a match.
 
         :param players: of every group its player, see :meth:`side`
         :param n_episodes: number of episodes
         :param seed: of the first episode; the others follow: seed + 1, …
+        :param deterministic: greedily; else models draw by PyTorch's own generator, and nothing is exact
+        :param watch: hears of every reset and every step
         :raises ValueError: if a group has no player, for no episode, or a negative seed
         """
         require_count("n_episodes", n_episodes)
@@ -244,7 +270,8 @@ class Arena:
         sides = [self.side(group, players[group]) for group in self.layout.group_names]
         ended: list[dict[str, float]] = []
         for first in range(0, n_episodes, self.env.num_envs):
-            ended += self._round(sides, seed + first, min(self.env.num_envs, n_episodes - first))
+            n_counted = min(self.env.num_envs, n_episodes - first)
+            ended += self._round(sides, seed + first, n_counted, deterministic, watch)
         columns = {name: np.array([episode[name] for episode in ended]) for name in ended[0]}
         returns = {group: columns.pop(f"return_{group}") for group in self.layout.group_names}
         seeds = seed + np.arange(n_episodes)
@@ -255,13 +282,17 @@ class Arena:
         won = {group: columns[metric] for group, metric in self.wins.items()}
         return {group: won[group] if group in won else 1.0 - next(iter(won.values())) for group in self.winners()}
 
-    def _round(self, sides: Sequence[Side], first: int, n_counted: int) -> list[dict[str, float]]:
+    def _round(
+        self, sides: Sequence[Side], first: int, n_counted: int, deterministic: bool, watch: Watch
+    ) -> list[dict[str, float]]:
         """
         One episode in each world; worlds whose episode is over, or that have none, go on uncounted.
 
         :param sides: of each group
         :param first: seed of the first world's episode
         :param n_counted: so many of the worlds have an episode that counts
+        :param deterministic: see :meth:`play`
+        :param watch: likewise
         :return: metrics, returns and length of each episode
         """
         env, offset = self.env, first % BLOCK
@@ -278,22 +309,36 @@ class Arena:
 
         env.seed(first)
         rows[worlds] = np.asarray(env.reset())
+        watch(np.zeros(env.num_envs, dtype=bool), ())
         ended: dict[int, dict[str, float]] = {}
         steps = 0
         while len(ended) < n_counted:
+            states = self._seen_states(sides, len(rows), worlds)
             for i, block in enumerate(blocks):
                 numbers = range(max(i * BLOCK - offset, 0), min((i + 1) * BLOCK - offset, n_counted))
                 if all(number in ended for number in numbers):
                     continue
+                self._states = None if states is None else states[block]
                 for side in sides:
-                    side.fill(actions[block], rows[block], playing[side.group][block], generators[side.group][block])
+                    playing_here, drawing_here = playing[side.group][block], generators[side.group][block]
+                    side.fill(actions[block], rows[block], playing_here, drawing_here, deterministic)
             observations, _, dones, infos = env.step(actions[worlds].copy())
             rows[worlds] = np.asarray(observations)
             steps += 1
+            watch(dones, infos)
             for i in np.flatnonzero(dones[:n_counted]).tolist():
                 if i not in ended:
                     ended[i] = {**infos[i]["episode_metrics"], "length": steps}
         return [ended[i] for i in range(n_counted)]
+
+    def _seen_states(self, sides: Sequence[Side], n_rows: int, worlds: slice) -> np.ndarray | None:
+        """The worlds' states in their rows, those of the first world where there is none (rows, state); for who sees them."""
+        if not any(side.sees_states for side in sides):
+            return None
+        states = np.stack(self.env.env_method("state"))
+        seen = np.repeat(states[:1], n_rows, axis=0)
+        seen[worlds] = states
+        return seen
 
 
 def _paths_in(given: Any) -> Iterator[Any]:

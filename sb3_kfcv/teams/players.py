@@ -244,6 +244,29 @@ def load_player(path: str | os.PathLike[str], group: str | None = None) -> Actor
             return _actors_of(attributes, parameters)
 
 
+def roles_in(path: str | os.PathLike[str]) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """
+    Whom a file can play, and who played the others in its training.
+
+    :param path: as :func:`load_player` takes it
+    :return: the groups that it plays; and by group the players of others, as :func:`written` gave them
+    :raises FileFormatError: if the file is damaged, or of another kind
+    :raises ValueError: if there is no such file
+    """
+    file: Path = existing(Path(path))
+    if not file.is_file():
+        raise ValueError(f"there is no file {path} to take a player of")
+    with open_archive(file, *PLAYER_KINDS) as archive:
+        if archive.kind == "player":
+            player = player_in(archive)
+            return tuple(dict.fromkeys(player.layout.groups[i] for i in player.agents)), {}
+        with refusals(archive, "attributes"):
+            attributes = without_retired(archive.read("attributes"))
+            team = attributes.get("team")
+            groups = archive.read("teams") if "teams" in archive else [team] if team else attributes["layout"].group_names
+            return tuple(groups), dict(attributes.get("opponents") or {})
+
+
 def _actors_of(attributes: Mapping[str, Any], parameters: Mapping[str, Any]) -> ActorPolicy:
     """The actors of a model, from its attributes and the parameters of its policy."""
     layout, team, settings = attributes["layout"], attributes.get("team"), dict(attributes["policy_kwargs"])

@@ -28,6 +28,7 @@ class JointEnv(gym.Env):
     ``state``, ``next_state`` float32 (state,): the world before and after the step, where the env has a ``state_space``
     ``episode_metrics``       dict of floats, at the episode's end: the world's own metrics and ``return_<group>``, the
                               mean over the group's agents; each stands in the info by its own name, too
+    ``terminal_picture``      at the episode's end, in the mode ``"rgb_array"``: the world before its next reset
     ========================  =======================================================================================
 
     Agents may differ in their spaces, die, join late, come back, and be cut off one by one; whoever is not in the world has
@@ -115,6 +116,8 @@ class JointEnv(gym.Env):
         if over:
             info["episode_metrics"] = self._metrics()
             info.update(info["episode_metrics"])
+            if self.render_mode == "rgb_array":
+                info["terminal_picture"] = self.render()
         return self._join(observations), float(self._weights @ agent_rewards), over and not truncated, truncated, info
 
     def render(self) -> Any:

@@ -31,7 +31,8 @@ class ParticleVecEnv(VecEnv):
     =========================== ====================================================================================
 
     and at the episode's end ``terminal_observation``, ``TimeLimit.truncated``, each of ``metric_names`` as a float, and
-    all of these in the dict ``episode_metrics``. Arrays that were returned are never overwritten.
+    all of these in the dict ``episode_metrics``; with a ``render_mode``, ``terminal_scene``. Arrays that were returned are
+    never overwritten.
 
     As in SB3's ``DummyVecEnv``, ``seed(seed)`` gives world i the seed ``seed + i`` at the next reset.
 
@@ -133,6 +134,8 @@ class ParticleVecEnv(VecEnv):
             metrics = dict(zip(self.metric_names, values, strict=True))
             infos[world].update(metrics, episode_metrics=metrics, terminal_observation=last)
             infos[world]["TimeLimit.truncated"] = cut
+            if self.render_mode is not None:
+                infos[world]["terminal_scene"] = self.worlds.scene(world)
 
     def close(self) -> None:
         """There is nothing to release."""
