@@ -45,8 +45,8 @@ Made by
 
     {command}
 
-of {runs}. Of each algorithm the run with the best last evaluation is filmed and measured: that is a choice by the evaluation, so the
-numbers of single runs below flatter; the comparison over all seeds does not.
+of {runs}. Of each algorithm the run with the best last evaluation is filmed and measured. That is a choice by the
+evaluation, so the numbers of single runs flatter; the comparison over all seeds does not.
 """
 
 
