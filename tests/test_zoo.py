@@ -26,6 +26,7 @@ from sb3_kfcv.vec_env.subproc import TracedSubprocVecEnv
 from zoo import demo, train
 from zoo.hyperparams import check, load_entry, merged, parse_pairs
 from zoo.run_folder import RunFolder
+from zoo.runs import find_runs
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -366,6 +367,8 @@ def test_the_demo_makes_what_it_promises(tmp_path, capsys):
     assert {"learning_curve.png", "learning_curve.npz", "grassland.gif"} <= {path.name for path in tmp_path.iterdir()}
     with np.load(tmp_path / "learning_curve.npz") as measured:
         assert measured["return_wolf"].shape == (len(measured["timesteps"]), demo.EPISODES_PER_MEASUREMENT)
+    (run,) = find_runs([str(tmp_path)])
+    assert (run.algo, run.env_id, run.seed, run.has_ended) == ("kfcv_maddpg", "Grassland-v0", 1, True)
 
 
 def test_a_continued_run_takes_the_next_seed_and_keeps_to_its_algorithm_and_world(tmp_path, capsys):

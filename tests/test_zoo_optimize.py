@@ -11,7 +11,8 @@ import pytest
 import yaml
 
 from zoo import optimize, train
-from zoo.search_space import Range, SearchSpace, decoded, encoded, nested
+from zoo.hyperparams import flat, nested
+from zoo.search_space import Range, SearchSpace, decoded, encoded
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -166,7 +167,8 @@ def test_choices_come_back_as_they_were():
     choices = [[64, 64], [128], None, True, 0.5, "lin_1e-3", {"a": 1}]
     found = SearchSpace({"x": choices})
     assert [decoded({"x": encoded(choice)}, found)["x"] for choice in choices] == choices
-    assert nested({"a.b": 1, "a.c": 2, "d": 3}) == {"a": {"b": 1, "c": 2}, "d": 3}
+    settings = {"a.b": 1, "a.c": 2, "d": 3}
+    assert nested(settings) == {"a": {"b": 1, "c": 2}, "d": 3} and flat(nested(settings)) == settings
 
 
 @pytest.mark.parametrize(

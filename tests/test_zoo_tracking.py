@@ -13,7 +13,7 @@ from wandb.proto import wandb_internal_pb2
 from zoo import cli, train
 from zoo.run_folder import RunFolder
 from zoo.series import tensorboard_series
-from zoo.tracking import flat
+from zoo.tracking import as_cells
 
 BLOCK, HEADER, FILE_HEADER = 32_768, 7, 7
 FULL, LAST = 1, 4
@@ -92,9 +92,9 @@ def test_settings_are_on_the_hparams_page(tmp_path):
     assert [info.name.tag for info in compared] and all(info.name.tag in logged for info in compared)
 
 
-def test_flat():
+def test_settings_as_cells():
     nested = {"a": {"b": 1, "c": {"d": True}}, "e": [64, 64], "f": None, "g": 0.5}
-    assert flat(nested) == {"a.b": 1, "a.c.d": True, "e": "[64, 64]", "f": "None", "g": 0.5}
+    assert as_cells(nested) == {"a.b": 1, "a.c.d": True, "e": "[64, 64]", "f": "None", "g": 0.5}
 
 
 def test_flags_of_tracking_alone_are_refused(tmp_path, capsys):

@@ -23,6 +23,7 @@ from sb3_kfcv.teams.players import JointModel
 from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env import make_vec_env
 from sb3_kfcv.vec_env.make import layout_of
+from zoo.command_line import as_it_was_typed
 from zoo.plots import ALGO_COLOURS, ALGO_LABELS, draw_curve, draw_references, new_figure, save_arrays, save_figure
 from zoo.recording import film, save_gif
 from zoo.run_folder import RunFolder
@@ -213,7 +214,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = ["--algo", ALGO, "--env", WORLD, "--preset", "tuned", "--seed", str(args.seed), "-f", str(folder)]
     training = build(make_parser().parse_all([*command, "--eval-freq", "-1", "--save-freq", "-1", "--verbose", "0"]))
     run = RunFolder.create(folder, ALGO, WORLD)
-    run.describe(training.hyperparams.to_dict(), vars(args), " ".join(["python zoo/demo.py", *(argv or sys.argv[1:])]))
+    run.describe(training.hyperparams.to_dict(), vars(training.args), as_it_was_typed("demo", argv))
     start_logs(training, run)
     env = make_vec_env(WORLD, EPISODES_PER_MEASUREMENT, args.seed + MEASUREMENT_SEED)
     clock = TrainByTheClock(60 * args.minutes)

@@ -184,9 +184,25 @@ def parse_pairs(flag: str, pairs: Sequence[str]) -> dict[str, Any]:
             value = yaml.safe_load(text)
         except yaml.YAMLError:
             raise ValueError(f'{flag} {key}: "{text}" is no valid YAML value') from None
-        for part in reversed(key.split(".")):
+        result = merged(result, nested({key: value}))
+    return result
+
+
+def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with dots in their names as nested maps."""
+    result: dict[str, Any] = {}
+    for name, value in settings.items():
+        for part in reversed(name.split(".")):
             value = {part: value}
         result = merged(result, value)
+    return result
+
+
+def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested maps as one, their names joined by dots: the inverse of :func:`nested`."""
+    result: dict[str, Any] = {}
+    for name, value in settings.items():
+        result.update(flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value})
     return result
 
 

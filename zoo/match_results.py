@@ -39,9 +39,10 @@ def table_lines(table: PayOffTable, quantity: str) -> list[list[str]]:
     return [head, *([label, *line] for label, line in zip(table.rows, cells, strict=True))]
 
 
-def shown(cell: Interval) -> str:
+def shown(cell: Interval, decimals: int = 2) -> str:
     """A mean and its interval, such as ``0.85 [0.79, 0.89]``."""
-    return f"{cell.mean:.2f}" + (f" [{cell.low:.2f}, {cell.high:.2f}]" if math.isfinite(cell.low) else "")
+    mean, low, high = (f"{value:.{decimals}f}" for value in cell)
+    return mean + (f" [{low}, {high}]" if math.isfinite(cell.low) else "")
 
 
 @dataclass

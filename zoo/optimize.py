@@ -35,11 +35,11 @@ from sb3_kfcv.saving.archive import library_versions
 from sb3_kfcv.vec_env.make import layout_of, metric_names_of
 from zoo import train
 from zoo.command_line import PAIRS, REFUSALS, SEVERAL, Parser, as_it_was_typed, refused, start, whole_number
-from zoo.hyperparams import check, load_entry, merged
+from zoo.hyperparams import check, load_entry, merged, nested
 from zoo.match_results import as_text, write_json, write_text
 from zoo.plots import ALGO_COLOURS, ALGO_LABELS, REFERENCE_COLOUR, new_figure, save_figure
 from zoo.run_folder import file_name
-from zoo.search_space import Range, SearchSpace, decoded, nested
+from zoo.search_space import Range, SearchSpace, decoded
 from zoo.workers import Task, end_with_parent, make_workers
 
 DESCRIPTION = """\

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import Normalize
+from matplotlib.colors import Normalize, to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
@@ -19,39 +20,65 @@ from sb3_kfcv.saving.files import atomic_write
 # Okabe and Ito's colours, which stay apart for colour-blind readers.
 ALGO_COLOURS = {"maddpg": "#0072B2", "per_maddpg": "#E69F00", "kfcv_maddpg": "#009E73"}
 ALGO_LABELS = {"maddpg": "MADDPG", "per_maddpg": "PER-MADDPG", "kfcv_maddpg": "KFCV-MADDPG"}
+OTHER_COLOUR = "#CC79A7"  # of algorithms that have none
 REFERENCE_COLOUR = "#666666"
+LINE_DASHES = ("-", "--", "-.", ":")  # of several lines of one algorithm
 REFERENCE_DASHES = ("--", ":", "-.")
 HEAT_MAP = "cividis"  # reads the same with every kind of colour vision
 
 DPI = 150
+PANELS_PER_ROW = 3
+LABEL_WIDTH = 26  # characters
+MOST_WITHIN = 4  # lines of a legend that leave room for the picture
+MOST_MARKERS = 60  # points of a line that are still told apart
 
 
 def new_figure(
-    n_panels: int, title: str | None = None, size: tuple[float, float] = (5.2, 3.8), columns: int | None = None
+    n_panels: int, title: str | None = None, size: tuple[float, float] = (5.2, 3.8), columns: int = PANELS_PER_ROW
 ) -> tuple[Figure, list[Axes]]:
     """
-    A figure with panels.
+    A figure with panels side by side, in rows.
 
     :param n_panels: how many
     :param title: over all of them
     :param size: width and height of each, in inches
-    :param columns: so many side by side; by default all
+    :param columns: so many in a row at most
     """
-    columns = min(columns or n_panels, n_panels)
-    rows = -(-n_panels // columns)
+    columns, rows = min(n_panels, columns), -(-n_panels // columns)
     figure = Figure(figsize=(size[0] * columns, size[1] * rows), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for spare in panels[n_panels:]:
-        spare.remove()
-    axes = panels[:n_panels]
-    for axis in axes:
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axis in axes[n_panels:]:
+        axis.remove()
+    for axis in axes[:n_panels]:
         axis.grid(alpha=0.25)
         axis.spines[["top", "right"]].set_visible(False)
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     if title:
         figure.suptitle(title)
-    return figure, axes
+    return figure, axes[:n_panels]
+
+
+def line_styles(algos: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    """
+    A colour and dashes for each line: the colour of its algorithm; several lines of one algorithm get shades of it, from dark
+    to light, and dashes of their own.
+
+    :param algos: label → algorithm
+    :return: label → colour, dashes
+    """
+    styles = {}
+    for algo in dict.fromkeys(algos.values()):
+        labels = [label for label, own in algos.items() if own == algo]
+        for i, label in enumerate(labels):
+            lightness = 0.5 * i / max(len(labels) - 1, 1)
+            styles[label] = (_lighter(ALGO_COLOURS.get(algo, OTHER_COLOUR), lightness), LINE_DASHES[i % len(LINE_DASHES)])
+    return styles
+
+
+def _lighter(colour: str, share: float) -> str:
+    red, green, blue = (share + (1 - share) * part for part in to_rgb(colour))
+    return to_hex((red, green, blue))
 
 
 def draw_curve(axis: Axes, steps: np.ndarray, episodes: np.ndarray, colour: str, label: str) -> None:
@@ -81,8 +108,47 @@ def draw_intervals(
     :param dashes: style of the line
     """
     means, low, high = np.array(intervals).T
-    axis.plot(steps, means, color=colour, label=label, marker="o", markersize=3, linestyle=dashes)
+    marker = "o" if len(means) <= MOST_MARKERS else None
+    axis.plot(steps, means, color=colour, label=label, marker=marker, markersize=3, linestyle=dashes)
     axis.fill_between(steps, low, high, color=colour, alpha=0.25, linewidth=0)
+
+
+def draw_estimates(
+    axis: Axes,
+    intervals: Mapping[str, Interval],
+    colours: Mapping[str, str],
+    values: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """
+    Estimates below each other, each with its interval as a bar.
+
+    :param axis: where to draw
+    :param intervals: label → estimate, from above
+    :param colours: label → colour
+    :param values: label → what was estimated from, drawn as small circles
+    """
+    for i, (label, own) in enumerate(intervals.items()):
+        axis.plot([own.low, own.high], [i, i], color=colours[label], linewidth=7, alpha=0.35, solid_capstyle="butt")
+        if values is not None:
+            heights = np.full(len(values[label]), i + 0.28)
+            axis.plot(values[label], heights, "o", markersize=4.5, markerfacecolor="none", color=colours[label])
+        axis.plot(own.mean, i, marker="|", markersize=16, markeredgewidth=2.5, color=colours[label])
+    axis.set_yticks(range(len(intervals)), map(wrapped, intervals))
+    axis.set_ylim(len(intervals) - 0.4, -0.6)
+    axis.grid(axis="y", visible=False)
+
+
+def draw_legend(axis: Axes) -> None:
+    """The names of the lines: within the picture where they are few, else below it."""
+    if len(axis.get_legend_handles_labels()[0]) > MOST_WITHIN:
+        axis.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.24), ncols=2)
+    else:
+        axis.legend(fontsize="small")
+
+
+def wrapped(label: str) -> str:
+    """A label in lines that leave room for the picture."""
+    return "\n".join(fill(line, LABEL_WIDTH) for line in label.split("\n"))
 
 
 def draw_heat_map(
@@ -136,6 +202,7 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     :param figure: the figure
     :param path: of the file
     """
+    figure.draw_without_rendering()  # the layout makes room for a legend below a picture when it sees it again
     with atomic_write(path) as file:
         figure.savefig(file, format="png", dpi=DPI)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from sb3_kfcv.common.naming import unknown_name
 from zoo.hyperparams import Hyperparams, check
-from zoo.run_folder import RunFolder, read_map
+from zoo.run_folder import RunFolder, file_name, read_map
 
 # How deep below a folder runs may lie: <sweep>/<cell>/<algo>/<env>_<k>.
 DEPTH = 5
@@ -67,6 +67,14 @@ class Run:
     @property
     def seed(self) -> int:
         return self.args["seed"]
+
+    @property
+    def tensorboard_folder(self) -> Path:
+        """Where its event files are; it holds none if they were turned off."""
+        elsewhere = self.args.get("tensorboard_log")
+        if not elsewhere:
+            return self.folder.path
+        return Path(elsewhere) / file_name(self.env_id) / f"{self.algo}_{self.folder.number}"
 
     @property
     def has_ended(self) -> bool:

@@ -10,7 +10,7 @@ from typing import Any, TypeGuard
 import yaml
 
 from sb3_kfcv.common.naming import unknown_name
-from zoo.hyperparams import ALGORITHMS, HYPERPARAMS, check, merged
+from zoo.hyperparams import ALGORITHMS, HYPERPARAMS, check, merged, nested
 from zoo.run_folder import read_map
 
 FOR_ALL = "all"
@@ -139,14 +139,4 @@ def decoded(params: Mapping[str, Any], space: SearchSpace) -> dict[str, Any]:
         domain = space.settings[name]
         choices: Sequence[Any] = () if isinstance(domain, Range) else domain
         result[name] = next((choice for choice in choices if encoded(choice) == value), value)
-    return result
-
-
-def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings with dots in their names as nested maps."""
-    result: dict[str, Any] = {}
-    for name, value in settings.items():
-        for part in reversed(name.split(".")):
-            value = {part: value}
-        result = merged(result, value)
     return result

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
@@ -33,6 +35,8 @@ def tensorboard_series(folder: str | Path) -> dict[str, Series]:
     :param folder: with the event files
     :return: tag, such as ``train/critic_loss`` → series; empty without event files
     """
+    if not Path(folder).is_dir():
+        return {}
     accumulator = EventAccumulator(str(folder), size_guidance={SCALARS: 0})
     accumulator.Reload()
     found = {}
@@ -47,6 +51,13 @@ def tensorboard_series(folder: str | Path) -> dict[str, Series]:
     return found
 
 
+def evaluation_files(folder: str | Path) -> dict[str, Path]:
+    """The files with the evaluations of a run, by their names: ``"eval"``, and those of yardsticks."""
+    files = {path.stem.removeprefix("evaluations_"): path for path in sorted(Path(folder).glob("evaluations_*.npz"))}
+    own = Path(folder) / "evaluations.npz"
+    return {"eval": own, **files} if own.is_file() else files
+
+
 def evaluations(folder: str | Path, name: str = "eval") -> dict[str, np.ndarray]:
     """
     All episodes of all evaluations of a run.
@@ -56,12 +67,58 @@ def evaluations(folder: str | Path, name: str = "eval") -> dict[str, np.ndarray]
     :return: ``timesteps`` (evaluations,), and each metric (evaluations, episodes); SB3's names (``results``, ``ep_lengths``)
     :raises ValueError: if there are none, with the nearest name
     """
-    files = {path.stem.removeprefix("evaluations_"): path for path in Path(folder).glob("evaluations_*.npz")}
-    if (own := Path(folder) / "evaluations.npz").is_file():
-        files["eval"] = own
+    files = evaluation_files(folder)
     if name not in files:
         raise ValueError(
             f"in {folder}: {unknown_name('evaluation', name, files)}" if files else f"{folder} has no evaluations"
         )
-    with np.load(files[name], allow_pickle=False) as arrays:
-        return {key: arrays[key] for key in arrays.files}
+    try:
+        with np.load(files[name], allow_pickle=False) as arrays:
+            return {key: arrays[key] for key in arrays.files}
+    except (OSError, EOFError, ValueError, BadZipFile) as error:
+        raise ValueError(f"{files[name]} cannot be read: {error}") from None
+
+
+@dataclass(frozen=True)
+class Progress:
+    """
+    How far a training was at its start and at the end of each of its episodes.
+
+    :param steps: env steps, ascending; those of episodes in hand are left out (1 + episodes,)
+    :param seconds: of wall-clock time; evaluations count, pauses before a resume do not (1 + episodes,)
+    """
+
+    steps: np.ndarray
+    seconds: np.ndarray
+
+    def episodes_at(self, steps: np.ndarray) -> np.ndarray:
+        """How many episodes had ended after so many env steps."""
+        return np.searchsorted(self.steps, steps, side="right") - 1
+
+    def seconds_at(self, steps: np.ndarray) -> np.ndarray:
+        """The wall-clock time that so many env steps took."""
+        return np.interp(steps, self.steps, self.seconds)
+
+
+def progress(monitor_file: Path, n_steps_before: int = 0) -> Progress:
+    """
+    The progress of a run, by its episodes.
+
+    :param monitor_file: of the run
+    :param n_steps_before: env steps that its model had when the run began
+    :raises ValueError: if there is no such file, or no episode in it
+    """
+    try:
+        lines = monitor_file.read_text(encoding="utf-8").split("\n")[1:-1]  # without the line that is being written
+        rows = list(csv.DictReader(lines))
+        lengths = np.array([float(row["l"]) for row in rows])
+        clock = np.array([float(row["t"]) for row in rows])
+    except OSError as error:
+        raise ValueError(f"cannot read {monitor_file}: {error.strerror}") from None
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(f"{monitor_file} is no monitor file of a training") from None
+    if not rows:
+        raise ValueError(f"{monitor_file} has no episode yet")
+    passed = np.diff(clock, prepend=0.0)
+    passed = np.where(passed < 0, clock, passed)  # worlds that cannot be resumed start their clock again
+    return Progress(n_steps_before + np.cumsum([0, *lengths]), np.cumsum([0.0, *passed]))

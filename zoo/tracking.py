@@ -13,6 +13,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import HParam, KVWriter
 
+from zoo.hyperparams import flat
 from zoo.run_folder import RunFolder
 
 # The other log formats cannot show a table of settings.
@@ -27,21 +28,14 @@ OF_TRACKING = ("wandb_project_name", "wandb_entity", "wandb_tags", "run_name")
 STEPS = "env_steps"
 
 
-def flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, bool | int | float | str]:
+def as_cells(settings: Mapping[str, Any]) -> dict[str, bool | int | float | str]:
     """
     Nested settings in one map, as tables can show them.
 
     :param settings: as YAML holds them
-    :param prefix: of the names
     :return: such as ``{"policy_kwargs.n_critics": 2}``; what is no number and no truth value as text
     """
-    result: dict[str, bool | int | float | str] = {}
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            result.update(flat(value, f"{prefix}{name}."))
-        else:
-            result[f"{prefix}{name}"] = value if isinstance(value, bool | int | float) else str(value)
-    return result
+    return {name: own if isinstance(own, bool | int | float) else str(own) for name, own in flat(settings).items()}
 
 
 class HyperparamsPage(BaseCallback):
@@ -56,7 +50,7 @@ class HyperparamsPage(BaseCallback):
         self.settings = settings
 
     def _on_training_start(self) -> None:
-        page = HParam(flat(self.settings), dict.fromkeys(COMPARED, 0.0))
+        page = HParam(as_cells(self.settings), dict.fromkeys(COMPARED, 0.0))
         self.logger.record("hparams", page, exclude=NOT_ELSEWHERE)
 
     def _on_step(self) -> bool:

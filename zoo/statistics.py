@@ -1,0 +1,165 @@
+"""
+What can be said of few training runs: inter-quartile means, stratified bootstrap intervals, probability of improvement and
+performance profiles, as in Agarwal et al. 2021, *Deep Reinforcement Learning at the Edge of the Statistical Precipice*.
+
+Scores are one number per run, in strata: world → (runs,). A bootstrap draws runs with replacement within each world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.stats import trim_mean
+
+from sb3_kfcv.common.evaluation import CONFIDENCE, Interval
+
+Scores = Mapping[str, np.ndarray]
+
+# Draws of the bootstrap.
+N_RESAMPLES = 5_000
+
+# Of fewer runs an interval says little: too few different samples can be drawn from them.
+ENOUGH_RUNS = 5
+
+
+def iqm(values: np.ndarray) -> np.ndarray:
+    """
+    The mean of the middle half: a quarter of the values, rounded down, is left out at either end.
+
+    :param values: (..., runs)
+    :return: (...)
+    """
+    return trim_mean(values, 0.25, axis=-1)
+
+
+def resampled(values: np.ndarray, rng: np.random.Generator, n_resamples: int = N_RESAMPLES) -> np.ndarray:
+    """
+    Runs drawn with replacement.
+
+    :param values: (runs,)
+    :param rng: draws them
+    :param n_resamples: how often
+    :return: (resamples, runs)
+    """
+    return values[rng.integers(len(values), size=(n_resamples, len(values)))]
+
+
+def iqm_curve(values: np.ndarray, rng: np.random.Generator, n_resamples: int = N_RESAMPLES) -> list[Interval]:
+    """
+    The IQM over runs at each of several times, and its 95 % bootstrap interval. A run is drawn with all its times.
+
+    :param values: (times, runs)
+    :param rng: of the bootstrap
+    :param n_resamples: its draws
+    :return: (times,); the bounds are NaN for a single run
+    """
+    n_runs = values.shape[1]
+    drawn = resampled(np.arange(n_runs), rng, n_resamples)
+    return [with_percentiles(float(iqm(own)), iqm(own[drawn]), n_runs) for own in values]
+
+
+def iqm_with_interval(scores: Scores, rng: np.random.Generator, n_resamples: int = N_RESAMPLES) -> Interval:
+    """
+    The IQM over all runs of all worlds, and its 95 % stratified bootstrap interval.
+
+    :param scores: world → (runs,)
+    :param rng: of the bootstrap
+    :param n_resamples: its draws
+    :return: the bounds are NaN where a world has a single run
+    """
+    estimate = iqm(np.concatenate([*scores.values()]))
+    draws = np.concatenate([resampled(values, rng, n_resamples) for values in scores.values()], axis=-1)
+    return with_percentiles(float(estimate), iqm(draws), fewest(scores))
+
+
+def improvement(better: Scores, than: Scores) -> float:
+    """
+    The probability that a run of the one has a higher score than a run of the other, P(X > Y); ties count half. The mean over
+    worlds, each of which counts the same.
+
+    :param better: X: world → (runs,)
+    :param than: Y, in the same worlds
+    """
+    return float(np.mean([_improvement(better[world], than[world]) for world in better]))
+
+
+def improvement_with_interval(
+    better: Scores, than: Scores, rng: np.random.Generator, n_resamples: int = N_RESAMPLES
+) -> Interval:
+    """
+    :func:`improvement` and its 95 % stratified bootstrap interval.
+
+    :param better: X: world → (runs,)
+    :param than: Y, in the same worlds
+    :param rng: of the bootstrap
+    :param n_resamples: its draws
+    :return: the bounds are NaN where a world has a single run of either
+    """
+    draws = np.mean(
+        [
+            _improvement(resampled(better[world], rng, n_resamples), resampled(than[world], rng, n_resamples))
+            for world in better
+        ],
+        axis=0,
+    )
+    return with_percentiles(improvement(better, than), draws, min(fewest(better), fewest(than)))
+
+
+def _improvement(better: np.ndarray, than: np.ndarray) -> np.ndarray:
+    """P(X > Y) of each draw: (..., runs) and (..., runs) → (...)."""
+    difference = better[..., :, None] - than[..., None, :]
+    return ((difference > 0) + 0.5 * (difference == 0)).mean(axis=(-2, -1))
+
+
+def profile(scores: Scores, thresholds: np.ndarray) -> np.ndarray:
+    """
+    The performance profile: the share of all runs whose score is above a threshold.
+
+    :param scores: world → (runs,)
+    :param thresholds: (thresholds,)
+    :return: (thresholds,)
+    """
+    return _above(np.concatenate([*scores.values()]), thresholds)
+
+
+def profile_with_intervals(
+    scores: Scores, thresholds: np.ndarray, rng: np.random.Generator, n_resamples: int = N_RESAMPLES
+) -> list[Interval]:
+    """
+    :func:`profile` and its 95 % stratified bootstrap intervals, one for each threshold.
+
+    :param scores: world → (runs,)
+    :param thresholds: (thresholds,)
+    :param rng: of the bootstrap
+    :param n_resamples: its draws
+    """
+    draws = np.concatenate([resampled(values, rng, n_resamples) for values in scores.values()], axis=-1)
+    return [
+        with_percentiles(float(share), _above(draws, threshold)[..., 0], fewest(scores))
+        for share, threshold in zip(profile(scores, thresholds), thresholds[:, None], strict=True)
+    ]
+
+
+def _above(values: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
+    """(..., runs) and (thresholds,) → (..., thresholds)."""
+    return (values[..., None, :] > thresholds[:, None]).mean(axis=-1)
+
+
+def fewest(scores: Scores) -> int:
+    """The number of runs in the world that has the fewest."""
+    return min(map(len, scores.values()))
+
+
+def with_percentiles(estimate: float, draws: np.ndarray, n_runs: int) -> Interval:
+    """
+    An estimate and the interval that holds the middle 95 % of its bootstrap draws.
+
+    :param estimate: takes the place of the mean
+    :param draws: (resamples,)
+    :param n_runs: from how many they were drawn; a single one does not vary, and has no interval: its bounds are NaN
+    """
+    if n_runs < 2:
+        return Interval(estimate, np.nan, np.nan)
+    low, high = np.quantile(draws, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return Interval(estimate, float(low), float(high))
