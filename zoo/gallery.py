@@ -148,6 +148,7 @@ def section(env_id: str, runs: Sequence[Run], args: argparse.Namespace, folder: 
     if len({run.algo for run in runs}) > 1:
         words = ["-o", str(folder / f"{name}_comparison")]
         parts += ["### All seeds", block(_short(COMPARE, paths, words), COMPARE.run([*paths, *words]))]
+        parts.append(f"![All seeds in {env_id}](gallery/{name}_comparison/compare.png)")
     of_best = [str(run.folder.path) for run in best.values()]
     layout = layout_of(World.of(runs[0]).make(1))
     measured = [*of_best, *(word for words in scripted(layout) for word in words)]
