@@ -48,6 +48,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         print(f"error: {unknown_name('command', words[0], COMMANDS)}", file=sys.stderr)
         return 2
+    from zoo.command_line import show_warnings_plainly
+
+    show_warnings_plainly()
     try:
         return importlib.import_module(f"zoo.{name}").main(words[1:])
     except KeyboardInterrupt:

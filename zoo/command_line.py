@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
@@ -112,6 +113,15 @@ def refused(error: Exception) -> int:
     return BAD_INPUT
 
 
+def show_warnings_plainly() -> None:
+    """Print warnings as one sentence, without the place in the code that they come from."""
+
+    def show(message: Warning | str, *_: Any) -> None:
+        print(f"note: {message}", file=sys.stderr)
+
+    warnings.showwarning = show  # type: ignore[assignment]
+
+
 def start(main: Callable[[], int], interrupted: str = "interrupted") -> NoReturn:
     """
     Run a command as this process, and end with its exit status.
@@ -119,6 +129,7 @@ def start(main: Callable[[], int], interrupted: str = "interrupted") -> NoReturn
     :param main: the command
     :param interrupted: what to say after Ctrl-C
     """
+    show_warnings_plainly()
     try:
         sys.exit(main())
     except KeyboardInterrupt:
