@@ -55,6 +55,15 @@ def test_everybody_meets_everybody(tmp_path, runs, capsys):
     assert Image.open(tmp_path / "match.png").size[0] > 500
 
 
+def test_the_world_is_that_of_the_runs(tmp_path, runs):
+    players = ["--team", f"wolf={runs / 'Grassland-v0_1'}", "--team", "sheep=graze"]
+    told = play(tmp_path / "told", *players)
+    assert match.main([*players, "-n", "6", "-o", str(tmp_path / "found")]) == 0
+    found = json.loads((tmp_path / "found" / "match.json").read_text())
+    assert found["matches"] == told["matches"] and found["env_kwargs"] == told["env_kwargs"]
+    assert (found["env"], found["env_kwargs"]["n_wolves"]) == ("Grassland-v0", 2)
+
+
 def test_results_do_not_depend_on_the_number_of_worlds(tmp_path, runs):
     words = ["--team", f"wolf={runs / 'Grassland-v0_1'}", "wolf=random", "--team", f"sheep={runs / 'Grassland-v0_2'}"]
     one, many = (play(tmp_path / n, *words, "--n-envs", n) for n in ("1", "64"))
@@ -187,15 +196,10 @@ def test_refused_in_one_sentence_before_anything_is_played(tmp_path, runs, bad, 
     assert not list(tmp_path.rglob("*"))
 
 
-def test_who_plays_a_further_group_is_one(monkeypatch, capsys, tmp_path):
+def test_who_plays_a_further_group_is_one(capsys, tmp_path):
     """In a world of three groups, two make the table."""
-    from mpe2 import simple_world_comm_v3
-
-    def three_groups(env_id, n_envs, env_kwargs):
-        return make_vec_env(lambda: simple_world_comm_v3.parallel_env(max_cycles=3), n_envs)
-
-    monkeypatch.setattr(match, "make_vec_env", three_groups)
-    words = ["--env", "three", "-n", "3", "-o", str(tmp_path), "--team", "adversary=random", "agent=random"]
+    world = ["--env", "mpe2/simple_world_comm_v3", "--env-kwargs", "max_cycles:3"]
+    words = [*world, "-n", "3", "-o", str(tmp_path), "--team", "adversary=random", "agent=random"]
     assert match.main([*words, "leadadversary=random", "leadadversary=random,random"]) == 2
     assert (
         "adversary and agent make the table; give leadadversary one player, not random, random+random"

@@ -14,7 +14,8 @@ from sb3_kfcv import MADDPG, load_normalization, make_vec_env
 from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import layout_of
 from zoo import enjoy, evaluate, record_video, recording, train
-from zoo.playing import World, require_pictures
+from zoo.playing import require_pictures
+from zoo.worlds import World
 
 SIZES = {"n_wolves": 2, "n_sheep": 2, "n_grass": 1, "max_steps": 5}
 WORLD = [f"{name}:{value}" for name, value in SIZES.items()]

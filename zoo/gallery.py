@@ -26,11 +26,11 @@ from sb3_kfcv.vec_env.make import layout_of
 from zoo import compare, evaluate, plot, record_video
 from zoo.command_line import REFUSALS, Parser, as_it_was_typed, refused, start, whole_number
 from zoo.match_results import write_text
-from zoo.playing import World
 from zoo.plots import ALGO_LABELS
 from zoo.run_folder import file_name
 from zoo.runs import Run, find_runs
 from zoo.series import evaluations
+from zoo.worlds import World
 
 DESCRIPTION = """\
 Make a page of runs: per world the learning curves of all of them, and of each algorithm its best run, filmed, measured beside

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import glob
-import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -27,14 +26,13 @@ from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.matches import Arena, PayOffTable, Side, curve, pay_off_table
 from sb3_kfcv.matches.pay_off import interval_of, shares_of
 from sb3_kfcv.saving.archive import FileFormatError, library_versions
-from sb3_kfcv.saving.files import is_path
 from sb3_kfcv.teams.players import scripted_for
-from sb3_kfcv.vec_env.make import make_vec_env
 from zoo.command_line import PAIRS, REFUSALS, SEVERAL, Parser, as_it_was_typed, refused, start, whole_number
-from zoo.hyperparams import check_env_kwargs, parse_pairs
 from zoo.match_results import Curve, Ratings, as_text, described, shown, table_lines, write_curves, write_table
-from zoo.run_folder import RunFolder, file_to_play
-from zoo.runs import natural
+from zoo.named_players import found, label_of, labelled, parse_team, run_of
+from zoo.run_folder import RunFolder
+from zoo.runs import Run, natural
+from zoo.worlds import World, find_world
 
 DESCRIPTION = """\
 Play everybody of one group against everybody of another: saved models of any algorithm, checkpoints, runs, and scripted
@@ -46,6 +44,7 @@ EXAMPLES = (
     "--curve logs/kfcv_maddpg/Grassland-v0_1 --against sheep=graze",
 )
 
+DEFAULT_WORLD = "Grassland-v0"
 RANDOM = "random"  # plays the groups that no row and no column is for
 
 
@@ -53,7 +52,7 @@ def make_parser() -> Parser:
     """The command line."""
     parser = Parser("match", DESCRIPTION, EXAMPLES)
     add = parser.add_argument
-    add("--env", default="Grassland-v0", help="id of the world (default: %(default)s)")
+    add("--env", help=f"id of the world (default: that of the runs, else {DEFAULT_WORLD})")
     add(
         "--team",
         **SEVERAL,
@@ -69,7 +68,7 @@ def make_parser() -> Parser:
         "--curve", action="append", default=[], metavar="RUN_DIR", help="measure a run over its training, too; may be repeated"
     )
     add("--against", metavar="GROUP=PLAYER", help="the opponent of --curve")
-    add("--env-kwargs", **PAIRS, help="settings of the world")
+    add("--env-kwargs", **PAIRS, help="settings of the world where they differ from those of the runs")
     add("--n-envs", type=int, default=64, help="worlds side by side, for speed alone (default: %(default)s)")
     add("--num-threads", type=int, default=1, help="threads of PyTorch (default: %(default)s)")
     add("-o", "--output", default="match", help="folder of the results (default: %(default)s)")
@@ -81,7 +80,8 @@ class Matches:
     """
     All that is to be played, found and checked.
 
-    :param arena: where
+    :param world: where
+    :param arena: worlds of it
     :param groups: of the rows, and of the columns
     :param players: group → label → side; of further groups the one that plays all along
     :param sources: group → label → name of a scripted policy, or path of a file
@@ -92,6 +92,7 @@ class Matches:
     :param opponents: whom they meet there: group → side
     """
 
+    world: World
     arena: Arena
     groups: tuple[str, str]
     players: dict[str, dict[str, Side]]
@@ -106,46 +107,6 @@ class Matches:
     def others(self) -> dict[str, Side]:
         """Who plays the groups that are neither rows nor columns."""
         return {group: one for group, own in self.players.items() if group not in self.groups for one in own.values()}
-
-
-def parse_team(words: Sequence[str], known: Sequence[str], flag: str = "--team") -> dict[str, list[str]]:
-    """
-    Group → players, as named on the command line, in the order in which the groups are named first.
-
-    :param words: such as ``["wolf=chase", "wolf=wolves.zip"]``
-    :param known: the groups of the world
-    :param flag: for the message
-    :raises ValueError: for a text that is no pair, and for an unknown group, with the nearest one
-    """
-    named: dict[str, list[str]] = {}
-    for word in words:
-        group, equals, player = word.partition("=")
-        if not equals or not group or not player:
-            raise ValueError(f'{flag} takes GROUP=PLAYER, such as {known[0]}=random; got "{word}"')
-        if group not in known:
-            raise ValueError(unknown_name("group", group, known))
-        named.setdefault(group, []).append(player)
-    return named
-
-
-def found(player: str, group: str, best: bool = False) -> list[str]:
-    """
-    The players that a word of the command line stands for: names of scripted policies, and paths of files; a mixture is
-    several of these between commas.
-
-    :param player: a name, a file, a run folder, a pattern of paths, or a mixture
-    :param group: whom it is to play
-    :param best: of run folders take the model of the best evaluation
-    :raises ValueError: if a pattern matches nothing, there is no such file, or a folder is no run, or has no model
-    """
-    if "," in player:
-        return [",".join(one for part in player.split(",") for one in found(part, group, best))]
-    paths = [player]
-    if glob.has_magic(player):
-        paths = sorted(glob.glob(player), key=natural)
-        if not paths:
-            raise ValueError(f'no file and no folder matches "{player}"')
-    return [str(file_to_play(path, group if best else None)) if is_path(path) else path for path in paths]
 
 
 def fit(arena: Arena, group: str, player: str, best: bool) -> list[str]:
@@ -183,43 +144,16 @@ def side(arena: Arena, group: str, player: str) -> Side:
     return arena.side(group, player.split(",") if "," in player else player)
 
 
-def label_of(player: str) -> str:
+def runs_of(team: Sequence[str], curves: Sequence[str]) -> list[Run]:
     """
-    A short name: that of a scripted policy, ``kfcv_maddpg_1`` for the model of a run, with ``best`` or the number of env steps
-    where it is not the last one, else that of the file.
+    The runs among those that the command line names.
 
-    :param player: name of a scripted policy, or path of a file
+    :param team: pairs GROUP=PLAYER
+    :param curves: run folders
     """
-    if "," in player:
-        return "+".join(map(label_of, player.split(",")))
-    if not is_path(player):
-        return player
-    path = Path(player).resolve()
-    folder = path.parent.parent if path.parent.name == "players" else path.parent
-    if not list(folder.glob("*/args.yml")):
-        return path.stem
-    run = f"{folder.parent.name}_{folder.name.rpartition('_')[2]}"
-    steps = re.search(r"_(\d+)(_steps)?\.zip$", path.name)
-    if path == RunFolder.existing(folder).last_model.resolve():
-        return run
-    return f"{run}@{steps.group(1)}" if steps else f"{run} {path.stem.removesuffix('_model')}"
-
-
-def labelled(players: Sequence[str]) -> dict[str, str]:
-    """
-    Label → player, each once; those of one short name are told apart by as much of their paths as it takes.
-
-    :param players: names of scripted policies, and paths of files
-    """
-    own = list({player if not is_path(player) else Path(player).resolve(): player for player in players}.values())
-    labels = [label_of(player) for player in own]
-    for i, player in enumerate(own):
-        rivals = [other for k, other in enumerate(own) if label_of(other) == label_of(player) and k != i]
-        if rivals and is_path(player):
-            parts, *others = [Path(one).resolve().parts for one in (player, *rivals)]
-            depth = next(n for n in range(1, 1 + len(parts)) if parts[-n:] not in [rival[-n:] for rival in others])
-            labels[i] = "/".join(parts[-depth:])
-    return dict(zip(labels, own, strict=True))
+    words = [*(player for pair in team for player in pair.partition("=")[2].split(",")), *curves]
+    paths = [path for word in words for path in (sorted(glob.glob(word), key=natural) if glob.has_magic(word) else [word])]
+    return [run for path in paths if (run := run_of(path)) is not None]
 
 
 def build(args: argparse.Namespace) -> Matches:
@@ -233,12 +167,14 @@ def build(args: argparse.Namespace) -> Matches:
         require_count(flag, value)
     require_count("--seed", args.seed, least=0)
     th.set_num_threads(args.num_threads)
-    env_kwargs = check_env_kwargs(args.env, parse_pairs("--env-kwargs", args.env_kwargs))
-    env = make_vec_env(args.env, min(args.n_envs, args.n_episodes), env_kwargs=env_kwargs)
-    arena = Arena(env)
+    runs_named = runs_of([*args.team, *([args.against] if args.against else [])], args.curve)
+    if args.env is None and not runs_named:
+        args.env = DEFAULT_WORLD
+    world = find_world(args, runs_named)
+    arena = Arena(world.make(min(args.n_envs, args.n_episodes)))
     known = arena.layout.group_names
     if len(known) < 2:
-        raise ValueError(f"{args.env} has one group, {known[0]}; a match is between two")
+        raise ValueError(f"{world.env_id} has one group, {known[0]}; a match is between two")
     if bool(args.curve) != bool(args.against):
         raise ValueError("--curve RUN_DIR and --against GROUP=PLAYER go together: who is measured, and against whom")
 
@@ -275,7 +211,7 @@ def build(args: argparse.Namespace) -> Matches:
     metric = args.metric or arena.default_quantity(trained if args.curve and not args.team else groups[0])
     if metric not in arena.quantities():
         raise ValueError(unknown_name("metric", metric, arena.quantities()))
-    return Matches(arena, groups, players, sources, metric, runs, snapshots, trained, opponents)
+    return Matches(world, arena, groups, players, sources, metric, runs, snapshots, trained, opponents)
 
 
 def play_table(matches: Matches, n_episodes: int, seed: int) -> PayOffTable:
@@ -328,8 +264,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return refused(OSError(f"the results cannot be written to {args.output}: {error.strerror}"))
     about = {
         "command": as_it_was_typed("match", argv),
-        "env": args.env,
-        "env_kwargs": parse_pairs("--env-kwargs", args.env_kwargs),
+        "env": matches.world.env_id,
+        "env_kwargs": matches.world.env_kwargs,
         "seed": args.seed,
         "n_episodes": args.n_episodes,
         "players": matches.sources,

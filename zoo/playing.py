@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import glob
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +23,12 @@ from sb3_kfcv.saving.checkpoints import checkpoints_in
 from sb3_kfcv.saving.files import existing, is_path
 from sb3_kfcv.saving.normalization import load_normalization
 from sb3_kfcv.teams.players import PLAYER_KINDS, Mixture, load_player, roles_in, scripted_for
-from sb3_kfcv.vec_env.make import layout_of, make_vec_env
-from sb3_kfcv.vec_env.named_wrappers import NamedWrapper, find_wrappers
+from sb3_kfcv.vec_env.make import layout_of
 from zoo.command_line import PAIRS, SEVERAL, Parser, whole_number
-from zoo.hyperparams import check_env_kwargs, merged, parse_pairs
-from zoo.match import found, label_of, labelled, parse_team
+from zoo.named_players import found, is_file, label_of, labelled, parse_team, run_of
 from zoo.run_folder import RunFolder, file_to_play
 from zoo.runs import Run, natural, pick_run, runs_below
+from zoo.worlds import World, find_world
 
 AS_TRAINED = "as in its training"
 
@@ -88,36 +86,6 @@ def check_players(args: argparse.Namespace) -> None:
     if sum(chosen.values()) > 1:
         raise ValueError(f"{' and '.join(flag for flag, given in chosen.items() if given)} exclude each other")
     th.set_num_threads(args.num_threads)
-
-
-@dataclass
-class World:
-    """
-    Where is played.
-
-    :param env_id: id of the world
-    :param env_kwargs: its settings
-    :param env_wrapper: SuperSuit's wrappers around it
-    """
-
-    env_id: str
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
-    env_wrapper: list[NamedWrapper] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, run: Run) -> World:
-        """The world of a training."""
-        hyperparams = run.hyperparams
-        return cls(run.env_id, hyperparams.env_kwargs, hyperparams.env_wrapper)
-
-    def make(self, n_envs: int, drawn: bool = False) -> VecEnv:
-        """
-        :param n_envs: how many worlds
-        :param drawn: whether they are to be drawn
-        :raises ValueError: for a setting that they do not take
-        """
-        kwargs = {**self.env_kwargs, **({"render_mode": "rgb_array"} if drawn else {})}
-        return make_vec_env(self.env_id, n_envs, env_kwargs=kwargs, wrappers=find_wrappers(self.env_wrapper))
 
 
 @dataclass
@@ -209,7 +177,7 @@ def playing(args: argparse.Namespace, n_envs: int, drawn: bool = False) -> Playi
     if not words and not _is_complete(args, runs):
         picked = pick_run(args.folder, args.algo, args.env, args.exp_id)
         words, runs = [str(picked.folder.path)], [picked, *runs]
-    world = _find_world(args, runs, words)
+    world = find_world(args, runs, words)
     arena = Arena(world.make(n_envs, drawn))
     if drawn:
         require_pictures(world, arena)
@@ -223,20 +191,6 @@ def require_pictures(world: World, arena: Arena) -> None:
     arena.env.reset()
     if not arena.env.has_attr("scene") and arena.env.get_images()[0] is None:
         raise ValueError(f"{world.env_id} draws no pictures; zoo/enjoy.py --no-render tells its numbers")
-
-
-def run_of(word: str) -> Run | None:
-    """The run that a folder or file belongs to, if it does to one."""
-    path = Path(word)
-    for folder in (path, path.parent, path.parent.parent):
-        if _is_file(word) and len(list(folder.glob("*/args.yml"))) == 1:
-            return Run.at(folder)
-    return None
-
-
-def _is_file(word: str) -> bool:
-    """Whether a word means a file or folder, not a scripted policy."""
-    return "," not in word and (is_path(word) or Path(word).is_dir())
 
 
 def _expanded(word: str, args: argparse.Namespace) -> list[str]:
@@ -261,25 +215,11 @@ def _expanded(word: str, args: argparse.Namespace) -> list[str]:
     return expanded
 
 
-def _find_world(args: argparse.Namespace, runs: Sequence[Run], words: Sequence[str] = ()) -> World:
-    """The world of the first run, or that of ``--env``, with the settings of ``--env-kwargs``."""
-    of_it = [run for run in runs if args.env in (None, run.env_id)]
-    if not of_it and args.env is None:
-        raise ValueError(f"say with --env in which world {words[0]} is to play")
-    trained_in = [World.of(run) for run in of_it]
-    world = trained_in[0] if trained_in else World(args.env)
-    for run, other in zip(of_it, trained_in, strict=True):
-        if other != world:
-            print(f"note: {run.folder.path} was trained in another {world.env_id}; all play as in the first", file=sys.stderr)
-    world.env_kwargs = merged(world.env_kwargs, check_env_kwargs(world.env_id, parse_pairs("--env-kwargs", args.env_kwargs)))
-    return world
-
-
 def _is_complete(args: argparse.Namespace, runs: Sequence[Run]) -> bool:
     """Whether ``--team`` alone says who plays every group."""
     if not args.team or (args.env is None and not runs):
         return False
-    world = _find_world(args, runs)
+    world = find_world(args, runs)
     layout = layout_of(world.make(1))
     return set(_named(args, world, layout.group_names)) == set(layout.group_names)
 
@@ -331,7 +271,7 @@ def _sources(
     free = [group for group in layout.group_names if group not in fixed]
     if not free:
         raise ValueError(f"--team says who plays every group; leave out {word}")
-    if not _is_file(word):
+    if not is_file(word):
         able = [group for group in free if set(word.split(",")) <= set(scripted_for(layout, group))]
         return dict.fromkeys(able or free[:1], word), {}
     run = run_of(word)
