@@ -9,6 +9,7 @@ import logging
 import os
 import platform
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -23,6 +24,7 @@ from typing import Any
 LOOK = 0.1  # seconds between two looks at the processes
 LIVES = 4  # a process that is killed is started again, so often in all
 PATIENCE = 30.0  # seconds until a file that was just written is seen by all machines
+CONNECT = 10.0  # seconds until a cluster that does not answer is taken for absent
 OBJECT_STORE = 100 << 20  # bytes of Ray's memory for shared objects, of which there are none here
 
 NO_RAY = 'clusters need Ray: pip install "sb3-kfcv[cluster]"'
@@ -208,7 +210,6 @@ class RayWorkers(Workers):
     def __init__(self, address: str | None, n_workers: int | None, threads: int) -> None:
         super().__init__(n_workers, threads)
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # a task that claims no GPU may still see them
         try:
             import ray
         except ImportError:
@@ -219,9 +220,12 @@ class RayWorkers(Workers):
             "include_dashboard": False,
         }
         try:
+            if address and ":" in address:
+                socket.create_connection(host_and_port(address), timeout=CONNECT).close()  # Ray itself would try for minutes
             ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, **({} if address else alone))
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            raise ValueError(f"no Ray cluster answers at {address}: {' '.join(str(error).split())}") from None
+        except (OSError, RuntimeError, ValueError) as error:
+            where = address or "this machine"
+            raise ValueError(f"no Ray cluster answers at {where}: {' '.join(str(error).split())}") from None
         ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # the machines need not find this package for it
         self._ray = ray
         self._carry_out = ray.remote(num_cpus=threads, max_retries=-1)(carry_out)
@@ -256,6 +260,17 @@ class RayWorkers(Workers):
 
     def close(self) -> None:
         self._ray.shutdown()
+
+
+def host_and_port(address: str) -> tuple[str, int]:
+    """
+    :param address: such as ``"10.0.0.1:6379"``
+    :raises ValueError: if it is none
+    """
+    host, _, port = address.rpartition("://")[2].rpartition(":")
+    if not port.isdecimal():
+        raise ValueError("an address is HOST:PORT, or auto")
+    return host, int(port)
 
 
 def carry_out(task: Task, threads: int) -> int | str:
