@@ -1,6 +1,7 @@
 """Sweeps on a Ray cluster of several machines, all of them on this one: what is killed goes on elsewhere, to the same bits."""
 
 import contextlib
+import json
 import os
 import re
 import signal
@@ -178,3 +179,26 @@ def test_a_sweep_whose_machine_dies_equals_an_undisturbed_one(tmp_path, cluster)
         assert yaml.safe_load(run.place.progress.read_text())["steps"] == 12_000
         assert len([*Path(run.place.log_folder, run.algo).glob("HardSpread-v0_*")]) == 1
         assert_equal_runs(folder_of(run), folder_of(undisturbed))
+
+
+def test_a_search_on_a_cluster(tmp_path, cluster):
+    """The machines of a cluster try the trials of zoo/optimize.py."""
+    words = ["--algo", "maddpg", "--env", "HardSpread-v0", "--env-kwargs", "n_agents:2", "max_steps:5", "-n", "60"]
+    words += [
+        "-params",
+        "n_envs:2",
+        "learning_starts:10",
+        "--n-trials",
+        "4",
+        "--n-startup-trials",
+        "2",
+        "--eval-episodes",
+        "2",
+    ]
+    words += ["--n-jobs", "2", "--address", cluster.address, "-o", str(tmp_path / "search")]
+    done = subprocess.run(
+        [sys.executable, "zoo/optimize.py", *words], cwd=ROOT, env=ENVIRONMENT, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert len(json.loads((tmp_path / "search" / "trials.json").read_text())["trials"]) == 4
+    assert (tmp_path / "search" / "best.yml").is_file()

@@ -500,6 +500,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         args = make_parser().parse_all(words)
+        if args.worker:
+            signal.signal(signal.SIGTERM, interrupt)
+            end_with_parent()
         th.set_num_threads(max(1, args.num_threads))
         search = build(args)
     except REFUSALS as error:
@@ -507,8 +510,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         return refused(OSError(f"the study cannot be written to {args.output}: {error.strerror}"))
     if args.worker:
-        end_with_parent()
-        signal.signal(signal.SIGTERM, interrupt)
         for _ in search.work():
             pass
         return 0
