@@ -160,6 +160,17 @@ def test_mpe_trains_saves_and_loads(world, continuous_actions, tmp_path):
     assert model.replay_buffer.dones.max() == 0  # MPE's episodes end by their time limit
 
 
+@needs_mpe2
+def test_algorithms_take_names(tmp_path):
+    model = MADDPG("MlpPolicy", "mpe2/simple_spread_v3", **QUICK).learn(30)
+    assert model.layout.agents == ("agent_0", "agent_1", "agent_2")
+    model.save(tmp_path / "model")
+    again = MADDPG.load(tmp_path / "model", "mpe2/simple_spread_v3")
+    again.set_env("mpe2/simple_spread_v3")
+    with pytest.raises(ValueError, match=r'unknown environment "mpe2/simple_spred_v3"; did you mean "mpe2/simple_spread_v3"'):
+        MADDPG("MlpPolicy", "mpe2/simple_spred_v3")
+
+
 @REGISTRY
 @pytest.mark.parametrize(
     ("name", "package", "settings"),

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_kfcv.common.checks import require_finite_columns
 from sb3_kfcv.common.patient_logs import patience
 from sb3_kfcv.saving.saveable import SaveableAlgorithm
-from sb3_kfcv.vec_env.make import facts_of, layout_of, wrap_env
+from sb3_kfcv.vec_env.make import env_named, facts_of, layout_of, wrap_env
 
 SelfJoint = TypeVar("SelfJoint", bound="JointAlgorithm")
 
@@ -33,12 +33,16 @@ class JointAlgorithm(SaveableAlgorithm):
     An off-policy algorithm whose env is a joint world: PettingZoo envs are wrapped, transitions are checked before anything
     learns from them, and the worlds' metrics are logged beside SB3's series.
 
-    :param args: as of SB3's ``OffPolicyAlgorithm``
+    :param policy: as of SB3's ``OffPolicyAlgorithm``
+    :param env: likewise; also the name of a PettingZoo world, such as ``mpe2/simple_tag_v3``
+    :param args: likewise
     :param kwargs: likewise
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, policy: Any, env: Any, *args: Any, **kwargs: Any) -> None:
         super().__init__(  # type: ignore[misc]
+            policy,
+            env_named(env),
             *args,
             sde_support=False,
             supported_action_spaces=(spaces.Box, spaces.MultiDiscrete),
@@ -74,7 +78,7 @@ class JointAlgorithm(SaveableAlgorithm):
         :param force_reset: reset it before the next step
         :raises ValueError: if its agents are not those that the model was made for
         """
-        env = self._wrap_env(maybe_make_env(env, self.verbose), self.verbose)
+        env = self._wrap_env(maybe_make_env(env_named(env), self.verbose), self.verbose)
         if layout_of(env) != self.layout:
             raise ValueError(f"the model is for {self.layout}; the env has {layout_of(env)}")
         super().set_env(env, force_reset)

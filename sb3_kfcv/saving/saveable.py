@@ -27,7 +27,7 @@ from sb3_kfcv.saving.normalization import normalization_state
 from sb3_kfcv.saving.parameters import check_network, check_optimizer
 from sb3_kfcv.saving.transitions import packed, unpacked
 from sb3_kfcv.saving.values import check_writable
-from sb3_kfcv.vec_env.make import layout_of
+from sb3_kfcv.vec_env.make import env_named, layout_of
 
 SelfSaveable = TypeVar("SelfSaveable", bound="SaveableAlgorithm")
 
@@ -171,7 +171,7 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
         :raises FileFormatError: if the file is damaged, crafted, or none of these
         :raises ValueError: if the env's agents are not those that the model was trained for
         """
-        env = None if env is None else cls._wrap_env(maybe_make_env(env, 0), 0)
+        env = None if env is None else cls._wrap_env(maybe_make_env(env_named(env), 0), 0)
         with open_archive(existing(path), *MODEL_KINDS) as archive:
             if print_system_info:
                 get_system_info()

@@ -132,6 +132,18 @@ def maker_of(env_id: str) -> Callable[..., Any]:
     return world.make
 
 
+def env_named(env: Any) -> Any:
+    """
+    The world that a name means, where gymnasium does not know it (it makes those that it does); whatever else is given stays.
+
+    :param env: a name, or an env
+    :raises ValueError: for an unknown name, with the nearest one
+    """
+    if not isinstance(env, str) or env in gym.registry or ":" in env:  # gymnasium imports module:id
+        return env
+    return maker_of(env)()
+
+
 def unknown_environment(env_id: str) -> str:
     """The message for an id that stands for no env."""
     return unknown_name("environment", env_id, [*WORLDS, *gym.registry, *world_names()])
