@@ -32,7 +32,7 @@ def space(tmp_path):
 def command(folder, space, *more, trials=4, steps=60):
     return [
         *("--algo", "maddpg", "--env", "HardSpread-v0", "--env-kwargs", "n_agents:2", "max_steps:5", "-n", str(steps)),
-        *("-params", "n_envs:2", "learning_starts:10", "buffer_size:100", "--space", str(space), "-o", str(folder)),
+        *("-params", "n_envs:2", "learning_starts:10", "buffer_size:200", "--space", str(space), "-o", str(folder)),
         *("--n-trials", str(trials), "--n-startup-trials", "2", "--n-evaluations", "2", "--eval-episodes", "3", *more),
     ]
 
@@ -157,8 +157,8 @@ def test_trials_that_fall_behind_are_cut_short(tmp_path, space):
 
 def test_the_space_of_every_algorithm_is_one_of_its_settings(tmp_path):
     for algo in ("maddpg", "per_maddpg", "kfcv_maddpg"):
-        found = SearchSpace.read(algo)
-        found.check(algo, "HardSpread-v0", train.load_entry(algo, "HardSpread-v0"))
+        words = ["--algo", algo, "--env", "HardSpread-v0", "-o", str(tmp_path / algo)]
+        found = optimize.build(optimize.make_parser().parse_all(words)).space  # which builds a learner with every choice
         assert isinstance(found.settings["learning_rate"], Range) and found.settings["gamma"]
     assert found.settings["replay_buffer_kwargs.n_folds"].whole
 
@@ -176,6 +176,9 @@ def test_choices_come_back_as_they_were():
     [
         ({"all": {"gama": [0.9]}}, 'unknown hyperparameter "gama"; did you mean "gamma"?'),
         ({"all": {"gamma": [0.9, "much"]}}, "hyperparameter gamma is 'much'; it must be a number"),
+        ({"all": {"gamma": [0.9, 5]}}, "the search space has gamma: 5, but gamma must be at least 0 and at most 1"),
+        ({"all": {"batch_size": [64, 9000]}}, "the search space has batch_size: 9000, but batch_size=9000 is larger than"),
+        ({"all": {"n_timesteps": [100, 200]}}, "n_timesteps is no setting to search"),
         ({"all": {"gamma": 0.9}}, "it must be a list of choices, or a range"),
         ({"all": {"gamma": {"low": 0.9, "hihg": 1}}}, 'unknown key of gamma "hihg"; did you mean "high"?'),
         ({"all": {"gamma": {"low": 0.9, "high": 0.5}}}, "needs numbers low < high"),
@@ -200,6 +203,10 @@ def test_bad_spaces(tmp_path, space, capsys, content, message):
         (["--pruner", "mean"], 'unknown pruner "mean"; did you mean "median"?'),
         (["--n-trials", "0"], "--n-trials must be a whole number of at least 1, got 0"),
         (["--env", "HardSpred-v0"], 'unknown environment "HardSpred-v0"; did you mean "HardSpread-v0"?'),
+        (["--seed", "-1"], "--seed must be a whole number of at least 0, got -1"),
+        (["--study-name", "a/b"], "--study-name is part of file names"),
+        (["--storage", "sqlite:////nope/x.db"], "the study cannot be kept in sqlite:////nope/x.db: "),
+        (["--storage", "foo://x"], "the study cannot be kept in foo://x: "),
         (["--n-trial", "3"], 'unknown flag "--n-trial"; did you mean "--n-trials"?'),
     ],
 )

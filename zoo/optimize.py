@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import re
 import signal
 import sys
 import warnings
@@ -24,6 +25,7 @@ import numpy as np
 import torch as th
 import yaml
 from filelock import FileLock, Timeout
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from stable_baselines3.common.callbacks import BaseCallback
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import each other as the package ``zoo``
@@ -35,12 +37,12 @@ from sb3_kfcv.saving.archive import library_versions
 from sb3_kfcv.vec_env.make import layout_of, metric_names_of
 from zoo import train
 from zoo.command_line import PAIRS, REFUSALS, SEVERAL, Parser, as_it_was_typed, refused, start, whole_number
-from zoo.hyperparams import check, load_entry, merged, nested
+from zoo.hyperparams import check, flat, load_entry, merged, nested
 from zoo.match_results import as_text, write_json, write_text
 from zoo.plots import ALGO_COLOURS, ALGO_LABELS, REFERENCE_COLOUR, new_figure, save_figure
 from zoo.run_folder import file_name
-from zoo.search_space import Range, SearchSpace, decoded
-from zoo.workers import Task, end_with_parent, make_workers
+from zoo.search_space import Range, SearchSpace, decoded, encoded
+from zoo.workers import Task, Workers, end_with_parent, make_workers
 
 DESCRIPTION = """\
 Search for better hyperparameters with Optuna. Each trial trains settings drawn from the search space (hyperparams/search.yml,
@@ -164,6 +166,21 @@ class Search:
         settings = check(args.algo, args.env, merged(self.entry, nested(decoded(params, self.space))))
         return train.build(args, hyperparams=settings)
 
+    def check_space(self) -> None:
+        """
+        Build a learner with every choice and both ends of every range, beside the first of every other setting.
+
+        :raises ValueError: for what it does not take
+        """
+        ends = self.space.ends()
+        first = {name: values[0] for name, values in ends.items()}
+        for name, values in ends.items():
+            for value in values:
+                try:
+                    self.training({key: encoded(own) for key, own in {**first, name: value}.items()}, self.args.seed)
+                except ValueError as error:
+                    raise ValueError(f"the search space has {name}: {value}, but {error}") from None
+
     def value(self, trial: Any) -> float:
         """
         Train with each seed.
@@ -282,13 +299,18 @@ def make_pruner(args: argparse.Namespace) -> Any:
 def make_storage(args: argparse.Namespace) -> Any:
     """Where the study lies."""
     import optuna
+    import sqlalchemy
     from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
-    if args.storage is not None and "://" in args.storage:
-        return optuna.storages.get_storage(args.storage)
     path = args.storage or str(Path(args.output) / "journal.log")
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    return optuna.storages.JournalStorage(JournalFileBackend(path, lock_obj=JournalFileOpenLock(path)))
+    try:
+        if "://" in path:
+            return optuna.storages.get_storage(path)
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        return optuna.storages.JournalStorage(JournalFileBackend(path, lock_obj=JournalFileOpenLock(path)))
+    except (ImportError, OSError, ValueError, sqlalchemy.exc.SQLAlchemyError) as error:
+        why = next(iter(str(error).splitlines()), type(error).__name__)
+        raise ValueError(f"the study cannot be kept in {path}: {why}") from None
 
 
 def build(args: argparse.Namespace) -> Search:
@@ -306,6 +328,9 @@ def build(args: argparse.Namespace) -> Search:
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
     for flag in ("n_trials", "n_seeds", "n_evaluations", "eval_episodes", "n_jobs", "num_threads"):
         require_count(f"--{flag.replace('_', '-')}", getattr(args, flag))
+    require_count("--seed", args.seed, least=0)
+    if args.study_name is not None and not re.fullmatch(r"[\w.-]+", args.study_name):
+        raise ValueError(f"--study-name is part of file names: letters, digits, _, . and - only, not {args.study_name!r}")
     for flag, known in (("sampler", SAMPLERS), ("pruner", PRUNERS)):
         if getattr(args, flag) not in known:
             raise ValueError(unknown_name(flag, getattr(args, flag), known))
@@ -318,15 +343,17 @@ def build(args: argparse.Namespace) -> Search:
     args.algo = hyperparams.algo
     space = SearchSpace.read(args.algo, args.space)
     search = Search(args, space, hyperparams.to_dict(), None)
-    space.check(args.algo, args.env, search.entry)
+    if not args.worker:  # else the one that began the study has done it
+        search.check_space()
     env = train.make_env(hyperparams, 1, args.seed, hyperparams.env_kwargs, training=False)
     train.require_everybody(hyperparams, layout_of(env))
     metrics = ["reward", "length", *metric_names_of(env)]
     if args.metric not in metrics:
         raise ValueError(unknown_name("metric", args.metric, metrics))
+    storage = make_storage(args)
     search.folder.mkdir(parents=True, exist_ok=True)
     search.study = optuna.create_study(
-        storage=make_storage(args),
+        storage=storage,
         pruner=make_pruner(args),
         study_name=args.study_name or f"{args.algo}_{file_name(args.env)}",
         direction="minimize" if args.minimize else "maximize",
@@ -351,10 +378,11 @@ def require_same(search: Search) -> None:
     if then is None:
         search.study.set_user_attr("search", own)
         return
-    for name, value in own.items():
-        if then[name] != value:
+    before, now = flat(then), flat(own)
+    for name in [*now, *before]:
+        if before.get(name) != now.get(name):
             raise ValueError(
-                f"the study {search.name} was begun with {name} {then[name]}, not {value}; "
+                f"the study {search.name} was begun with {name} {before.get(name)}, not {now.get(name)}; "
                 "give this one a --study-name of its own, or another -o"
             )
 
@@ -433,6 +461,12 @@ def draw(search: Search, path: Path) -> None:
     best_so_far = np.minimum.accumulate(values) if args.minimize else np.maximum.accumulate(values)
     numbers = [trial.number for trial in trials]
     axes[0].scatter(numbers, values, color=colour, s=12)
+    for trial in cut:
+        axes[0].axvline(
+            trial.number, color=REFERENCE_COLOUR, alpha=0.2, linewidth=1, label="cut short" if trial is cut[0] else ""
+        )
+    axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes[0].xaxis.set_major_formatter(ScalarFormatter())
     axes[0].step(numbers, best_so_far, where="post", color=REFERENCE_COLOUR, label="best so far")
     axes[0].set_xlabel("trial")
     axes[0].set_ylabel(args.metric.replace("_", " "))
@@ -447,24 +481,37 @@ def draw(search: Search, path: Path) -> None:
             axis.set_xticks(range(len(labels)), labels, fontsize="x-small")
             axis.set_xlim(-0.5, len(labels) - 0.5)
         axis.scatter(chosen, values, color=colour, s=12, alpha=0.7)
-        axis.set_xlabel(name)
+        axis.set_xlabel(name.removeprefix("policy_kwargs.").removeprefix("replay_buffer_kwargs."))
+        axis.set_ylabel(args.metric.replace("_", " "))
     save_figure(figure, path)
 
 
-def carry_out(search: Search, words: Sequence[str]) -> int:
+def workers_of(args: argparse.Namespace) -> Workers | None:
+    """
+    Who works on the study; ``None`` for this process alone.
+
+    :param args: the command line
+    :raises ValueError: if the cluster cannot be reached
+    """
+    if args.worker or (args.n_jobs == 1 and args.address is None):
+        return None
+    return make_workers(args.address, args.n_jobs, args.num_threads, local=args.address is None)
+
+
+def carry_out(search: Search, workers: Workers | None, words: Sequence[str]) -> int:
     """
     Work on the study in this process, or have others do it.
 
     :param search: what was built
-    :param words: the command line, for these
+    :param workers: these others
+    :param words: the command line, for them
     :return: exit status
     """
     args, known = search.args, len(search.ended())
-    if args.n_jobs == 1 and args.address is None:
+    if workers is None:
         for _ in search.work():
             known = tell_news(search, known)
         return 0
-    workers = make_workers(args.address, args.n_jobs, args.num_threads, local=args.address is None)
     logs = search.folder.resolve()
     program = (str(Path(__file__).resolve()), *words, "--worker")
     for k in range(args.n_jobs):
@@ -505,6 +552,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             end_with_parent()
         th.set_num_threads(max(1, args.num_threads))
         search = build(args)
+        workers = workers_of(args)
     except REFUSALS as error:
         return refused(error)
     except OSError as error:
@@ -518,18 +566,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"{args.n_trials} trials of {args.algo} on {args.env}, study {search.name} in {search.folder}{goes_on}")
     status = 0
     try:
-        status = carry_out(search, words)
+        status = carry_out(search, workers, words)
     finally:
         write_results(search)
     show(search, as_it_was_typed("optimize", argv))
-    return status
+    return status or int(not search.ranked())
 
 
 def show(search: Search, command: str) -> None:
     """Print the best trials, and where everything lies."""
-    best = search.ranked()
+    best, n_ended = search.ranked(), len(search.ended())
+    if n_ended < search.args.n_trials:
+        print(f"{n_ended} of {search.args.n_trials} trials have ended; others are at work, or to go on: {command}")
     if not best:
-        print(f"no trial came to its end; to go on: {command}")
+        why = next((trial.user_attrs["stopped"] for trial in search.ended() if "stopped" in trial.user_attrs), None)
+        print(f"no trial came to its end{f': {why}' if why else ''}")
         return
     names = list(search.space.settings)
     table = [["trial", search.args.metric, *names]]

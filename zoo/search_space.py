@@ -10,7 +10,7 @@ from typing import Any, TypeGuard
 import yaml
 
 from sb3_kfcv.common.naming import unknown_name
-from zoo.hyperparams import ALGORITHMS, HYPERPARAMS, check, merged, nested
+from zoo.hyperparams import ALGORITHMS, HYPERPARAMS
 from zoo.run_folder import read_map
 
 FOR_ALL = "all"
@@ -64,6 +64,8 @@ class SearchSpace:
             if not isinstance(settings, dict):
                 raise ValueError(f"{path}: {name} is {settings!r}; it must be a map of settings")
         given = {**content.get(FOR_ALL, {}), **content.get(algo, {})}
+        if "n_timesteps" in given:
+            raise ValueError(f"{path}: n_timesteps is no setting to search: more is always better")
         if not given:
             raise ValueError(f"{path} has no settings for {algo}")
         return cls({name: _domain(name, domain, path) for name, domain in given.items()})
@@ -72,16 +74,9 @@ class SearchSpace:
         """As YAML holds it."""
         return {name: vars(own) if isinstance(own, Range) else own for name, own in self.settings.items()}
 
-    def check(self, algo: str, env_id: str, entry: Mapping[str, Any]) -> None:
-        """
-        :param algo: name of the algorithm
-        :param env_id: id of the world
-        :param entry: what the settings are put into
-        :raises ValueError: for a setting that the algorithm does not know, and for a choice that it does not take
-        """
-        for name, domain in self.settings.items():
-            for value in (domain.low, domain.high) if isinstance(domain, Range) else domain:
-                check(algo, env_id, merged(entry, nested({name: value})))
+    def ends(self) -> dict[str, list[Any]]:
+        """Of each setting the choices, or the ends of the range."""
+        return {name: [own.low, own.high] if isinstance(own, Range) else own for name, own in self.settings.items()}
 
     def distributions(self) -> dict[str, Any]:
         """As Optuna takes them; choices that are no plain values as text, see :func:`decoded`."""

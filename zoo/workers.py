@@ -12,6 +12,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -210,6 +211,8 @@ class RayWorkers(Workers):
     def __init__(self, address: str | None, n_workers: int | None, threads: int) -> None:
         super().__init__(n_workers, threads)
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        if address and has_token():  # which Ray itself presents to a cluster that it has found, not to one that is named
+            os.environ.setdefault("RAY_AUTH_MODE", "token")
         try:
             import ray
         except ImportError:
@@ -220,12 +223,14 @@ class RayWorkers(Workers):
             "include_dashboard": False,
         }
         try:
-            if address and ":" in address:
-                socket.create_connection(host_and_port(address), timeout=CONNECT).close()  # Ray itself would try for minutes
+            named = known_address() if address == "auto" else address
+            if named and ":" in named:
+                socket.create_connection(host_and_port(named), timeout=CONNECT).close()  # Ray itself would try for minutes
             ray.init(address or "local", log_to_driver=False, logging_level=logging.ERROR, **({} if address else alone))
-        except (OSError, RuntimeError, ValueError) as error:
+        except (OSError, RuntimeError, ValueError, ray.exceptions.AuthenticationError) as error:
             where = address or "this machine"
-            raise ValueError(f"no Ray cluster answers at {where}: {' '.join(str(error).split())}") from None
+            why = " ".join(str(error).split())
+            raise ValueError(f"no Ray cluster answers at {where}, or it wants another token: {why}") from None
         ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])  # the machines need not find this package for it
         self._ray = ray
         self._carry_out = ray.remote(num_cpus=threads, max_retries=-1)(carry_out)
@@ -271,6 +276,20 @@ def host_and_port(address: str) -> tuple[str, int]:
     if not port.isdecimal():
         raise ValueError("an address is HOST:PORT, or auto")
     return host, int(port)
+
+
+def has_token() -> bool:
+    """Whether the user has a token that Ray's clusters may ask for (https://docs.ray.io/en/latest/ray-security/token-auth.html)."""
+    own_file = Path(os.environ.get("RAY_AUTH_TOKEN_PATH") or Path.home() / ".ray" / "auth_token")
+    return bool(os.environ.get("RAY_AUTH_TOKEN")) or own_file.is_file()
+
+
+def known_address() -> str | None:
+    """The address that ``auto`` means: of the environment, else of the cluster that was begun on this machine, if any."""
+    if os.environ.get("RAY_ADDRESS"):
+        return os.environ["RAY_ADDRESS"]
+    noted = Path(os.environ.get("RAY_TMPDIR") or tempfile.gettempdir(), "ray", "ray_current_cluster")
+    return noted.read_text().strip() if noted.is_file() else None
 
 
 def carry_out(task: Task, threads: int) -> int | str:
