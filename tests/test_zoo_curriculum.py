@@ -1,20 +1,25 @@
 """What the curriculum finds easy and hard: facts of transitions against the worlds' own state, and the command."""
 
 import json
+import shutil
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch as th
 
 from sb3_kfcv import make_vec_env
 from sb3_kfcv.common.evaluation import Interval
 from sb3_kfcv.curriculum.difficulty import UNSCORED
+from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import layout_of
 from zoo import plot_curriculum, train
 from zoo.plot_curriculum import assess, binned, correlation, in_words, pick_checkpoint
 from zoo.runs import Run
 from zoo.transition_facts import PLACES, Places, facts_of
 
+TERMS = ("distance", "collision", "cover")
+WOLF_TERMS, WORDS = ("distance", "capture", "boundary"), ("distance", "capture", "border")
 SMALL = {
     "Grassland-v0": ["n_wolves:2", "n_sheep:2", "n_grass:1", "max_steps:8"],
     "HardSpread-v0": ["n_agents:2", "max_steps:8"],
@@ -84,21 +89,63 @@ def test_neighbours_by_hand():
     assert places.to_neighbour() == pytest.approx(np.array([[1, np.sqrt(18), 1], [5, 5, np.nan]]), nan_ok=True)
 
 
+class Stored:
+    """As much of a replay buffer as facts are taken of."""
+
+    def __init__(self, pos, n_envs=1, **arrays):
+        self.arrays, self.pos, self.n_envs = {name: th.as_tensor(own) for name, own in arrays.items()}, pos, n_envs
+        self.n_rows = len(arrays["rewards"])
+
+    def rows(self, rows):
+        return SimpleNamespace(**{name: own[rows] for name, own in self.arrays.items()})
+
+
 def test_facts_of_rewards_ends_and_age_of_any_world():
     layout = SimpleNamespace(group_names=("cat", "dog"), members=lambda group: {"cat": (0,), "dog": (1, 2)}[group])
-    buffer = SimpleNamespace(
-        rewards=np.array([[[1, 2, 4]], [[5, 6, 8]], [[0, 0, 0]]], dtype=float),
-        alive=np.array([[[1, 1, 1]], [[1, 0, 1]], [[1, 1, 1]]], dtype=float),
-        dones=np.array([[[0, 0, 0]], [[0, 0, 1]], [[0, 0, 0]]], dtype=float),
-        n_rows=3,
+    stored = Stored(
         pos=1,  # row 0 is the newest, row 1 the oldest
-        n_envs=1,
+        rewards=np.array([[1.0, 2, 4], [5, 6, 8], [0, 0, 0]]),
+        alive=np.array([[1.0, 1, 1], [1, 0, 1], [1, 1, 1]]),
+        dones=np.array([[0.0, 0, 0], [0, 0, 1], [0, 0, 0]]),
     )
-    facts = facts_of(buffer, layout, "mpe2/simple_tag_v3", np.array([0, 1, 2]))
+    facts = facts_of(stored, layout, "mpe2/simple_tag_v3", np.array([0, 1, 2]))
     assert facts["reward per cat"].tolist() == [1, 5, 0]
     assert facts["reward per dog"].tolist() == [3, 8, 0]
     assert facts["agents whose episode ends (share)"].tolist() == [0, 0.5, 0]
     assert facts["age in the buffer (env steps)"].tolist() == [0, 2, 1]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "env_kwargs", "terms"),
+    [
+        ("HardSpread-v0", {"phi": 0.5}, {f"{term}_term": f"{term} term of the reward" for term in TERMS}),
+        ("HardSpread-v0", {"exclusive_cover": True}, {f"{term}_term": f"{term} term of the reward" for term in TERMS}),
+        (
+            "Grassland-v0",
+            {},
+            {f"wolf_{name}_term": f"wolves' {word} term of the reward" for name, word in zip(WOLF_TERMS, WORDS, strict=True)},
+        ),
+    ],
+)
+def test_terms_of_the_reward_are_those_that_the_world_sums_up(env_id, env_kwargs, terms):
+    env = make_vec_env(env_id, 1, seed=5, env_kwargs={**env_kwargs, "max_steps": 20})
+    layout, script = layout_of(env), {"HardSpread-v0": "greedy-nearest", "Grassland-v0": None}[env_id]
+    names = {"HardSpread-v0": {"agent": script}, "Grassland-v0": {"wolf": "chase", "sheep": "random"}}[env_id]
+    policy = TeamPolicy(layout, names, np.random.default_rng(0))
+    steps, observations, done = [], env.reset(), False
+    while not done:
+        following, _, dones, infos = env.step(policy.predict(observations)[0])
+        done, info = dones[0], infos[0]
+        after = info["terminal_observation"] if done else following[0]
+        steps.append((observations[0], after, info["agent_rewards"], info["agent_alive"], info["agent_terminated"]))
+        observations = following
+    parts = ("observations", "next_observations", "rewards", "alive", "dones")
+    stored = Stored(
+        0, **{name: np.stack(own).astype(np.float32) for name, own in zip(parts, zip(*steps, strict=True), strict=True)}
+    )
+    facts = facts_of(stored, layout, env_id, np.arange(len(steps)), env_kwargs.get("phi"))
+    for metric, fact in terms.items():
+        assert facts[fact].sum() == pytest.approx(info["episode_metrics"][metric], abs=1e-3), metric
 
 
 def test_binned_by_hand():
@@ -152,6 +199,24 @@ def test_the_command(runs, env, tmp_path, capsys):
     assert told["runs"][str(runs[env])]["checkpoint"] == 150
 
 
+def test_without_checkpoints_the_training_is_shown(runs, tmp_path, capsys):
+    copy = tmp_path / "kfcv_maddpg" / "HardSpread-v0_1"
+    shutil.copytree(runs["HardSpread-v0"], copy, ignore=shutil.ignore_patterns("rl_model_*"))
+    assert plot_curriculum.main([str(copy), "-o", str(tmp_path / "out")]) == 0
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["training.png"]
+    assert "has no checkpoint, so none of its transitions are looked at" in capsys.readouterr().err
+
+
+def test_runs_that_differ_are_told(runs, tmp_path, capsys):
+    other = command(tmp_path, "HardSpread-v0", "kfcv_maddpg", "gamma:0.9")
+    assert train.main(other) == 0
+    capsys.readouterr()
+    both = [str(runs["HardSpread-v0"]), str(tmp_path / "kfcv_maddpg"), "--checkpoint", "350"]
+    assert plot_curriculum.main([*both, "-o", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr().err
+    assert "the runs differ in gamma (0.9, 0.99)" in told and "is of the time after the curriculum: its scores are old" in told
+
+
 def test_bad_input(runs, tmp_path, capsys):
     def refused(*words):
         assert plot_curriculum.main([*words, "-o", str(tmp_path / "out")]) == 2
@@ -163,4 +228,5 @@ def test_bad_input(runs, tmp_path, capsys):
     assert "is a run of maddpg; only kfcv_maddpg has a curriculum" in refused(str(tmp_path / "maddpg"))
     assert "take one world\n" in refused(str(runs["HardSpread-v0"]), str(runs["Grassland-v0"]))
     assert "there is no run of zoo/train.py in" in refused(str(tmp_path / "nothing"))
+    assert "--checkpoint must be a whole number of at least 1, got -5" in refused("--checkpoint", "-5")
     assert 'unknown flag "--checkpoints"; did you mean "--checkpoint"?' in refused("--checkpoints", "3")

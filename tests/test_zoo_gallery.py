@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 
 import pytest
 
@@ -31,11 +32,30 @@ def test_the_page(logs, tmp_path, capsys):
     assert len(pictures) == 4 and all((tmp_path / picture).stat().st_size > 1000 for picture in pictures)
     assert "PER-MADDPG" in page and (logs / "maddpg/HardSpread-v0_1/HardSpread-v0/command.txt").read_text().strip() in page
 
-    words, result = re.search(r"\$ python zoo/evaluate.py (.*?)\n\n(.*?)\n```", page, re.DOTALL).groups()
+    words, result = re.search(r"\$ \S+ \S*zoo/evaluate.py (.*?)\n\n(.*?)\n```", page, re.DOTALL).groups()
     assert {"random", "oracle"} <= set(shlex.split(words))
     capsys.readouterr()
     assert evaluate.main(shlex.split(words)) == 0
     assert capsys.readouterr().out.strip() == result
+
+
+def test_runs_that_cannot_do_all_of_it_are_left_out_of_that(logs, tmp_path):
+    """An algorithm without evaluations, and a better run that has no model yet."""
+    copy = tmp_path / "logs"
+    shutil.copytree(logs / "maddpg" / "HardSpread-v0_1", copy / "maddpg" / "HardSpread-v0_1")
+    begun = copy / "maddpg" / "HardSpread-v0_2"
+    shutil.copytree(logs / "maddpg" / "HardSpread-v0_1", begun, ignore=shutil.ignore_patterns("*.zip"))
+    per = copy / "per_maddpg" / "HardSpread-v0_1"
+    shutil.copytree(logs / "per_maddpg" / "HardSpread-v0_1", per, ignore=shutil.ignore_patterns("evaluations.npz"))
+    assert gallery.main([str(copy), "-o", str(tmp_path), "-n", "3", "--films", "0"]) == 0
+    page = (tmp_path / "gallery.md").read_text()
+    assert "### MADDPG" in page and "### PER-MADDPG" in page and "### All seeds" not in page
+    (copy / "maddpg" / "HardSpread-v0_1" / "HardSpread-v0.zip").unlink()
+    for path in [*copy.glob("*/*/evaluations.npz"), *copy.glob("*/*/*.zip")]:
+        path.unlink()
+    assert gallery.main([str(copy), "-o", str(tmp_path), "-n", "3", "--films", "0"]) == 0
+    page = (tmp_path / "gallery.md").read_text()
+    assert "None of the runs has evaluations" in page and "None of the runs has a model or a checkpoint yet" in page
 
 
 def test_best_of_each(logs, monkeypatch):

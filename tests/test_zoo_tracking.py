@@ -116,8 +116,17 @@ def test_who_is_not_logged_in_is_told_in_one_sentence(tmp_path, capsys, monkeypa
 
     monkeypatch.setattr(wandb, "init", init)
     assert train.main(command(tmp_path, "--track")) == 2
-    expected = "(No API key configured.); log in with `wandb login`, or keep the records here with WANDB_MODE=offline\n"
+    expected = "No API key configured. (log in with `wandb login`, or keep the records here with WANDB_MODE=offline)\n"
     assert capsys.readouterr().err.endswith(expected)
+    assert not list(tmp_path.rglob("HardSpread-v0*"))
+
+
+def test_a_mode_that_there_is_not_is_told_in_one_sentence(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "ofline")
+    assert train.main(command(tmp_path, "--track")) == 2
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert sentence.startswith("error: Weights & Biases does not take the run: ") and "online" in sentence
+    assert not list(tmp_path.rglob("HardSpread-v0*"))
 
 
 def test_the_console_script(capsys):

@@ -21,10 +21,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import e
 
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.layout import AgentLayout
+from sb3_kfcv.saving.checkpoints import checkpoints_in
 from sb3_kfcv.teams.players import scripted_for
 from sb3_kfcv.vec_env.make import layout_of
 from zoo import compare, evaluate, plot, record_video
-from zoo.command_line import REFUSALS, Parser, as_it_was_typed, refused, start, whole_number
+from zoo.command_line import REFUSALS, Parser, as_it_was_typed, refused, start, this_command, whole_number
 from zoo.match_results import write_text
 from zoo.plots import ALGO_LABELS
 from zoo.run_folder import file_name
@@ -74,12 +75,14 @@ class Command:
         with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(complained):
             status = self.main(words)
         if status:
-            raise ValueError(complained.getvalue().strip().removeprefix("error: "))
-        return printed.getvalue().strip()
+            *_, last = complained.getvalue().strip().splitlines()
+            raise ValueError(last.removeprefix("error: "))
+        shown = [line for line in printed.getvalue().strip().splitlines() if not line.startswith("written: ")]
+        return "\n".join(shown).strip()
 
     def typed(self, words: Sequence[str]) -> str:
         """As one types it."""
-        return shlex.join(["python", f"zoo/{self.name}.py", *words])
+        return shlex.join([*this_command(self.name), *words])
 
 
 RECORD = Command("record_video", record_video.main)
@@ -100,6 +103,11 @@ def make_parser() -> Parser:
     return parser
 
 
+def plays(run: Run) -> bool:
+    """Whether a run has something to play yet."""
+    return run.has_ended or bool(checkpoints_in(run.folder.path))
+
+
 def last_reward(run: Run) -> float:
     """Mean reward of the last evaluation; −∞ where there is none."""
     try:
@@ -109,19 +117,19 @@ def last_reward(run: Run) -> float:
 
 
 def best_of_each(runs: Sequence[Run]) -> dict[str, Run]:
-    """Algorithm → its run with the best last evaluation, in the order of ``ALGO_LABELS``."""
+    """Algorithm → its run with the best last evaluation of those that can play, in the order of ``ALGO_LABELS``."""
     found: dict[str, Run] = {}
-    for run in runs:
+    for run in filter(plays, runs):
         if run.algo not in found or last_reward(run) > last_reward(found[run.algo]):
             found[run.algo] = run
     order = list(ALGO_LABELS)
     return dict(sorted(found.items(), key=lambda item: order.index(item[0]) if item[0] in order else len(order)))
 
 
-def scripted(layout: AgentLayout) -> list[list[str]]:
-    """What stands beside the trained ones, as words for zoo/evaluate.py: each scripted policy that all groups know."""
+def scripted(layout: AgentLayout) -> list[str]:
+    """What stands beside the trained ones: the scripted policies that can play all groups."""
     names = [scripted_for(layout, group) for group in layout.group_names]
-    return [[name] for name in names[0] if all(name in others for others in names)]
+    return [name for name in names[0] if all(name in others for others in names)]
 
 
 def block(command: str, result: str) -> str:
@@ -131,7 +139,8 @@ def block(command: str, result: str) -> str:
 
 def section(env_id: str, runs: Sequence[Run], args: argparse.Namespace, folder: Path) -> str:
     """
-    All about one world.
+    All about one world. What cannot be made of its runs (curves without evaluations, films without models) is left out, and
+    the page says so.
 
     :param env_id: id of the world
     :param runs: in it
@@ -141,42 +150,40 @@ def section(env_id: str, runs: Sequence[Run], args: argparse.Namespace, folder: 
     """
     name, best = file_name(env_id), best_of_each(runs)
     paths = [str(run.folder.path) for run in runs]
+    measured = [run for run in runs if last_reward(run) > -np.inf]
     parts = [f"## {env_id}"]
-    curves = ["-o", str(folder / f"{name}_curves.png")]
-    PLOT.run([*paths, *curves])
-    parts += [f"![Learning curves in {env_id}](gallery/{name}_curves.png)", _shown(PLOT, paths, curves)]
-    if len({run.algo for run in runs}) > 1:
-        words = ["-o", str(folder / f"{name}_comparison")]
-        parts += ["### All seeds", block(_short(COMPARE, paths, words), COMPARE.run([*paths, *words]))]
+    if measured:
+        own = [str(run.folder.path) for run in measured]
+        words = [*own, "-o", str(folder / f"{name}_curves.png")]
+        PLOT.run(words)
+        parts += [f"![Learning curves in {env_id}](gallery/{name}_curves.png)", f"    {PLOT.typed(words)}"]
+    else:
+        parts.append(f"None of the runs has evaluations: no curves, and no comparison ({', '.join(paths)}).")
+    if len({run.algo for run in measured}) > 1:
+        words = [*own, "-o", str(folder / f"{name}_comparison")]
+        parts += ["### All seeds", block(COMPARE.typed(words), COMPARE.run(words))]
         parts.append(f"![All seeds in {env_id}](gallery/{name}_comparison/compare.png)")
-    of_best = [str(run.folder.path) for run in best.values()]
+    if not best:
+        return "\n\n".join([*parts, "None of the runs has a model or a checkpoint yet: nothing to measure, and no films."])
     layout = layout_of(World.of(runs[0]).make(1))
-    measured = [*of_best, *(word for words in scripted(layout) for word in words)]
-    words = ["-n", str(args.n_episodes), "--seed", str(args.seed)]
-    parts += [
-        "### The best run of each algorithm",
-        block(EVALUATE.typed([*measured, *words]), EVALUATE.run([*measured, *words])),
-    ]
+    words = [*(str(run.folder.path) for run in best.values()), *scripted(layout)]
+    words += ["-n", str(args.n_episodes), "--seed", str(args.seed)]
+    parts += ["### The best run of each algorithm"]
+    if len(layout.group_names) > 1:
+        parts.append(
+            f"Each run plays all of {' and '.join(layout.group_names)}: what a group reaches depends on how good its own others are. "
+            "Who beats whom is for zoo/match.py to tell."
+        )
+    parts.append(block(EVALUATE.typed(words), EVALUATE.run(words)))
     for algo, run in best.items():
         label = ALGO_LABELS.get(algo, algo)
         parts.append(f"### {label}\n\nTrained by\n\n    {run.folder.config_file.with_name('command.txt').read_text().strip()}")
         if args.films:
             film = f"{name}_{algo}.gif"
-            words = ["-n", str(args.films), "--seed", str(args.seed), "-o", str(folder / film)]
-            RECORD.run([str(run.folder.path), *words])
-            parts += [f"![{label} in {env_id}](gallery/{film})", f"    {RECORD.typed([str(run.folder.path), *words])}"]
+            words = [str(run.folder.path), "-n", str(args.films), "--seed", str(args.seed), "-o", str(folder / film)]
+            RECORD.run(words)
+            parts += [f"![{label} in {env_id}](gallery/{film})", f"    {RECORD.typed(words)}"]
     return "\n\n".join(parts)
-
-
-def _short(command: Command, paths: Sequence[str], words: Sequence[str]) -> str:
-    """A command line in which many runs stand as their first and last one."""
-    if len(paths) <= 3:
-        return command.typed([*paths, *words])
-    return f"{command.typed([paths[0]])} … {shlex.join([paths[-1], *words])}"
-
-
-def _shown(command: Command, paths: Sequence[str], words: Sequence[str]) -> str:
-    return f"    {_short(command, paths, words)}"
 
 
 def build(args: argparse.Namespace) -> dict[str, list[Run]]:

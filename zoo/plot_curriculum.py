@@ -16,10 +16,12 @@ import numpy as np
 import torch as th
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
 from matplotlib.ticker import ScalarFormatter
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import each other as the package ``zoo``
 
+from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.evaluation import Interval, with_interval
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.curriculum.difficulty import UNSCORED, rank_correlation
@@ -32,16 +34,18 @@ from zoo.command_line import REFUSALS, Parser, as_it_was_typed, refused, start, 
 from zoo.hyperparams import find_algorithm
 from zoo.match_results import as_text, write_json
 from zoo.plots import ALGO_COLOURS, HEAT_MAP, REFERENCE_COLOUR, new_figure, save_figure
+from zoo.run_groups import doubts, grouped
 from zoo.runs import Run, find_runs, pick_run
 from zoo.series import Series, tensorboard_series
 from zoo.train import make_env
 from zoo.transition_facts import PLACES, facts_of, places_of
 
 DESCRIPTION = """\
-Show what the curriculum of KFCV runs did over the training (what minibatches were drawn from, scores per bucket, how stable
-the ranking is, how good the teachers are), and what easy and hard transitions are: their scores against distances, rewards
-and age, and a map of the plane coloured by difficulty. Several runs of one world give intervals over them. The second part
-needs a checkpoint, best one of the time when the curriculum ran: train with --keep-checkpoints -1 to have some."""
+Show what the curriculum of KFCV runs did over the training (stages, what minibatches were drawn from, scores per bucket, how
+stable the ranking is, how good the teachers are; a line for each run), and what easy and hard transitions are: their scores
+against distances, rewards and their terms, and age, with intervals over the runs, and a map of the plane coloured by
+difficulty. The second part needs a checkpoint, best one of the time when the curriculum ran: train with
+--keep-checkpoints -1 to have some."""
 EXAMPLES = (
     "",
     "logs/kfcv_maddpg/HardSpread-v0_1 --checkpoint 100000",
@@ -59,8 +63,12 @@ TEACHERS = {
 }
 BINS = 20
 MAP_CELLS = 40
+CROWDED = 10
+WRITTEN = ("training.png", "easy_and_hard.png", "map.png", "curriculum.json")
+_SPREAD = "; mean and 95 % interval over the runs"
 FEWEST_IN_A_CELL = 10  # cells of the map with fewer agents stay empty
 THOUSAND = 1000
+MEAN_DIFFICULTY = 0.5  # of all transitions
 EASY, HARD = 0.2, 0.8  # difficulty below and above which a transition is of the easiest and hardest fifth
 
 
@@ -112,7 +120,8 @@ class Assessed:
     @cached_property
     def facts(self) -> dict[str, np.ndarray]:
         """What can be said of them, see :func:`facts_of`."""
-        return facts_of(self.buffer, self.layout, self.run.env_id, self.rows)
+        phi = (self.run.config.get("env_kwargs") or {}).get("phi")
+        return facts_of(self.buffer, self.layout, self.run.env_id, self.rows, phi)
 
 
 def curriculum_ends(run: Run) -> float:
@@ -145,6 +154,8 @@ def assess(run: Run, steps: int | None, rescore: bool) -> Assessed:
     :raises ValueError: if there is no checkpoint, it is damaged, or it has too few transitions
     """
     checkpoint = Checkpoint(pick_checkpoint(run, steps))
+    if checkpoint.steps >= curriculum_ends(run) and not rescore:
+        print(f"note: {checkpoint.path} is of the time after the curriculum: its scores are old", file=sys.stderr)
     hyperparams = run.hyperparams
     env = make_env(hyperparams, hyperparams.n_envs, run.seed, hyperparams.env_kwargs, training=False)
     if hyperparams.normalize is not None:
@@ -159,6 +170,7 @@ def assess(run: Run, steps: int | None, rescore: bool) -> Assessed:
         rescore = True
     if rescore:
         buffer.refresh()
+    buffer.normalizer = None  # what is told of transitions is in the world's own units
     rows = np.flatnonzero(buffer.buckets[: buffer.n_rows] != UNSCORED)
     if not len(rows):
         raise ValueError(f"{checkpoint.path} has too few transitions for {buffer.n_folds} folds")
@@ -202,7 +214,10 @@ def in_words(name: str, rho: Interval) -> str:
 
 
 def _with_bounds(value: Interval) -> str:
-    return f"{value.mean:.2f}" if np.isnan(value.low) else str(value)
+    half = (value.high - value.low) / 2
+    size = max(abs(value.mean), abs(half) if np.isfinite(half) else 0)
+    decimals = 0 if size >= 100 else 1 if size >= 10 else 2 if size >= 0.1 else 3
+    return f"{value.mean:.{decimals}f}" if np.isnan(half) else f"{value.mean:.{decimals}f} ± {half:.{decimals}f}"
 
 
 def draw_training(series: Sequence[Mapping[str, Series]], runs: Sequence[Run], path: Path) -> None:
@@ -230,6 +245,8 @@ def draw_training(series: Sequence[Mapping[str, Series]], runs: Sequence[Run], p
     for axis in axes:
         axis.set_xlabel("training (env steps)")
         axis.axvline(ends, color=REFERENCE_COLOUR, linestyle=":", linewidth=1)
+        axis.set_xlim(0, 1.1 * ends)
+    drawn.annotate("the curriculum ends", (ends, 0.5), rotation=90, ha="right", va="center", fontsize="x-small")
     save_figure(figure, path)
 
 
@@ -269,6 +286,11 @@ def _draw_shares(axis: Axes, own: Mapping[str, Series], n_folds: int, colours: S
     stack = [uniform.values, *(np.where(over, 0, share) for share in shares)]
     labels = ["whole buffer (λ)", *(f"bucket {k}" for k in range(1, n_folds + 1))]
     axis.stackplot(uniform.steps, *stack, labels=labels, colors=["#DDDDDD", *colours], step="post")
+    stages = own["curriculum/stage"]
+    for stage in range(1, n_folds + 1):
+        inside = stages.steps[stages.values == stage]
+        if len(inside):
+            axis.annotate(f"stage {stage}", (inside[0], 1.01), annotation_clip=False, fontsize="x-small")
     axis.set_ylabel("share of each minibatch")
     axis.set_ylim(0, 1)
     axis.legend(fontsize="x-small", loc="lower right")
@@ -287,7 +309,9 @@ def draw_facts(assessed: Sequence[Assessed], found: Mapping[str, Mapping[str, In
     :param path: of the PNG
     """
     figure, axes = new_figure(len(found), columns=3)
-    figure.suptitle(_title(assessed, "what is easy and what is hard"))
+    figure.suptitle(
+        f"{_title(assessed, 'what is easy and what is hard')}\nline: mean, band: the middle half of the transitions"
+    )
     for axis, (name, own) in zip(axes, found.items(), strict=True):
         values = np.concatenate([one.facts[name] for one in assessed if name in one.facts])
         difficulty = np.concatenate([one.difficulty for one in assessed if name in one.facts])
@@ -300,6 +324,10 @@ def draw_facts(assessed: Sequence[Assessed], found: Mapping[str, Mapping[str, In
         axis.set_ylim(0, 1)
         if np.abs(middles).max() < THOUSAND:
             axis.xaxis.set_major_formatter(ScalarFormatter())
+        half = float(np.subtract(*np.quantile(values[there], [0.75, 0.25])))
+        if 0 < half < np.ptp(middles) / CROWDED:  # most values are crowded into a small part of the axis
+            axis.set_xscale("symlog", linthresh=half)
+            axis.tick_params("x", labelsize="x-small")
         axis.set_title(f"Spearman's ρ = {_with_bounds(own['correlation'])}", fontsize="small")
     save_figure(figure, path)
 
@@ -364,7 +392,9 @@ def _draw_cells(axis: Axes, points: np.ndarray, difficulty: np.ndarray, label: s
     counts, *_ = np.histogram2d(x, y, bins=(edges, edges))
     sums, *_ = np.histogram2d(x, y, bins=(edges, edges), weights=difficulty)
     means = np.where(counts >= FEWEST_IN_A_CELL, sums / np.maximum(counts, 1), np.nan)
-    image = axis.pcolormesh(edges, edges, means.T, cmap=HEAT_MAP, vmin=0, vmax=1)
+    spread = max(float(np.nanquantile(np.abs(means - MEAN_DIFFICULTY), 0.99)), 0.01)
+    scale = Normalize(MEAN_DIFFICULTY - spread, MEAN_DIFFICULTY + spread)
+    image = axis.pcolormesh(edges, edges, means.T, cmap=HEAT_MAP, norm=scale)
     axis.set_aspect("equal")
     axis.set_xlabel("x (world units)")
     axis.set_ylabel("y (world units)")
@@ -382,6 +412,8 @@ def build(args: argparse.Namespace) -> list[Run]:
     :param args: the command line
     :raises ValueError: one sentence that says what is wrong
     """
+    if args.checkpoint is not None:
+        require_count("--checkpoint", args.checkpoint)
     runs = find_runs(args.runs) if args.runs else [pick_run(args.folder, ALGO)]
     for run in runs:
         if run.algo != ALGO:
@@ -390,6 +422,8 @@ def build(args: argparse.Namespace) -> list[Run]:
             raise ValueError(
                 f"{runs[0].folder.path} is of {runs[0].env_id} and {run.folder.path} of {run.env_id}; take one world"
             )
+    for doubt in doubts(grouped(runs)[0]):
+        print(f"note: {doubt}", file=sys.stderr)
     return runs
 
 
@@ -404,39 +438,54 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = make_parser().parse_all(argv)
         runs = build(args)
-        series = [tensorboard_series(run.folder.path) for run in runs]
+        series = [tensorboard_series(run.tensorboard_folder) for run in runs]
         for run, own in zip(runs, series, strict=True):
             if "curriculum/share_bucket_1" not in own:
                 raise ValueError(f"the run in {run.folder.path} has logged nothing of a curriculum (yet)")
-        assessed = [assess(run, args.checkpoint, args.rescore) for run in runs]
+        kept = [run for run in runs if checkpoints_in(run.folder.path)]
+        for run in runs:
+            if run not in kept:
+                print(f"note: {run.folder.path} has no checkpoint, so none of its transitions are looked at", file=sys.stderr)
+        assessed = [assess(run, args.checkpoint, args.rescore) for run in kept]
         folder = Path(args.output)
         folder.mkdir(parents=True, exist_ok=True)
+        draw_training(series, runs, folder / "training.png")
+        if assessed:
+            tell(assessed, as_it_was_typed("plot_curriculum", argv), args.rescore, folder)
     except REFUSALS as error:
         return refused(error)
     except OSError as error:
         return refused(OSError(f"the results cannot be written to {args.output}: {error.strerror}"))
-    found = study(assessed)
-    draw_training(series, runs, folder / "training.png")
+    print(f"written: {', '.join(sorted(str(path) for path in folder.iterdir() if path.name in WRITTEN))}")
+    return 0
+
+
+def tell(assessed: Sequence[Assessed], command: str, rescored: bool, folder: Path) -> None:
+    """
+    Draw, write and print what is easy and what is hard.
+
+    :param assessed: of each run
+    :param command: that made it
+    :param rescored: whether all transitions were scored anew
+    :param folder: where the files go
+    """
+    found, env_id = study(assessed), assessed[0].run.env_id
     draw_facts(assessed, found, folder / "easy_and_hard.png")
-    written = ["training.png", "easy_and_hard.png"]
-    if runs[0].env_id in PLACES:
+    if env_id in PLACES:
         draw_map(assessed, folder / "map.png")
-        written.append("map.png")
     about = {
-        "command": as_it_was_typed("plot_curriculum", argv),
-        "env": runs[0].env_id,
+        "command": command,
+        "env": env_id,
         "runs": {str(one.run.folder.path): {"checkpoint": one.steps, "transitions": len(one.rows)} for one in assessed},
-        "rescored": args.rescore,
+        "rescored": rescored,
         "versions": library_versions(),
     }
     write_json(folder / "curriculum.json", {**about, "facts": found})
     table = [["of a transition", "ρ with difficulty", "mean of the easiest fifth", "of the hardest fifth"]]
     table += [[name, *(_with_bounds(own[key]) for key in ("correlation", "easy", "hard"))] for name, own in found.items()]
-    print(f"{_title(assessed, 'what is easy and what is hard')}\n\n{as_text(table)}\n")
-    if runs[0].env_id in PLACES:
+    print(f"{_title(assessed, 'what is easy and what is hard')}{_SPREAD if len(assessed) > 1 else ''}\n\n{as_text(table)}\n")
+    if env_id in PLACES:  # the first fact is the distance to the goal, of which the paper speaks
         print(in_words(*next((name, own["correlation"]) for name, own in found.items())))
-    print(f"written: {', '.join(str(folder / name) for name in (*written, 'curriculum.json'))}")
-    return 0
 
 
 if __name__ == "__main__":

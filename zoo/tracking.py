@@ -124,9 +124,12 @@ def tracked(args: argparse.Namespace, folder: RunFolder, settings: Mapping[str, 
             config={**settings, "algo": args.algo, "env": args.env, "seed": args.seed},
             settings=wandb.Settings(console="off", silent=args.verbose < 1),
         )
-    except wandb.Error as error:
-        hint = "log in with `wandb login`, or keep the records here with WANDB_MODE=offline"
-        raise ValueError(f"Weights & Biases does not take the run ({' '.join(str(error).split())}); {hint}") from None
+    except (wandb.Error, ValueError) as error:  # its settings are checked by pydantic, whose errors have many lines
+        why = error.errors()[0]["msg"] if hasattr(error, "errors") else " ".join(str(error).split())
+        hint = (
+            "log in with `wandb login`, or keep the records here with WANDB_MODE=offline" if "API key" in why else "see --help"
+        )
+        raise ValueError(f"Weights & Biases does not take the run: {why} ({hint})") from None
     try:
         yield [WandbWriter(run)]
     finally:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -703,6 +704,8 @@ def run(training: Training, folder: RunFolder, extra_callbacks: Sequence[BaseCal
             writers = stack.enter_context(tracked(training.args, folder, training.hyperparams.to_dict()))
             start_logs(training, folder, writers)
         except ValueError as error:
+            if training.args.resume is None:  # nothing has happened yet
+                shutil.rmtree(folder.path)
             return refused(error)
         except OSError as error:
             return refused(OSError(f"the run cannot write its logs: {error}"))
