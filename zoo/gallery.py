@@ -171,8 +171,8 @@ def section(env_id: str, runs: Sequence[Run], args: argparse.Namespace, folder: 
     parts += ["### The best run of each algorithm"]
     if len(layout.group_names) > 1:
         parts.append(
-            f"Each run plays all of {' and '.join(layout.group_names)}: what a group reaches depends on how good its own others are. "
-            "Who beats whom is for zoo/match.py to tell."
+            f"Each run plays all of {' and '.join(layout.group_names)}: what a group reaches depends on how good the others "
+            "are. Who beats whom is for zoo/match.py to tell."
         )
     parts.append(block(EVALUATE.typed(words), EVALUATE.run(words)))
     for algo, run in best.items():
