@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ METRIC_NAMES = {"results": REWARD, "ep_lengths": "length"}
 
 # What --group-by knows beside the settings: the seed, the preset, and the folder over <algo>/<env>_<k>, a cell of a sweep.
 FURTHER_SETTINGS = ("seed", "preset", "folder")
+
+SEED_FOLDER = re.compile(r"seed_\d+")
 
 Data = TypeVar("Data")
 
@@ -96,8 +99,10 @@ def algo_label(algo: str) -> str:
 
 def settings_of_run(run: Run) -> dict[str, str]:
     """All settings of a run, those of nested maps with dots, and ``FURTHER_SETTINGS``; as text."""
-    folder = run.folder.path.resolve()
-    further = {"seed": run.seed, "preset": run.args.get("preset") or "default", "folder": folder.parents[1].name}
+    folder = run.folder.path.resolve().parents[1]
+    if SEED_FOLDER.fullmatch(folder.name):  # of a sweep: the setting is above it
+        folder = folder.parent
+    further = {"seed": run.seed, "preset": run.args.get("preset") or "default", "folder": folder.name}
     return {name: str(value) for name, value in {**flat(run.config), **further}.items()}
 
 
