@@ -309,6 +309,9 @@ def test_runs_that_lack_a_metric_are_left_out_and_that_is_told(tmp_path, logs, c
 REFUSED = [
     ("plot {tmp}/nothing", "there is no run of zoo/train.py in {tmp}/nothing"),
     ("plot {tmp}/none", "of 2 runs none will do: {tmp}/none/maddpg/Grassland-v0_1 has no evaluations"),
+    ("plot {tmp}/none", "has no evaluations; try -y rollout/ep_rew_mean (rewards of the training), or --list"),
+    ("plot {logs} -o curve.jpg", "-o writes a file that ends in .png, not curve.jpg"),
+    ("plot {logs} -o {tmp}/folder", "{tmp}/folder.png cannot be written: Is a directory"),
     ("plot {logs} -y sheep_eatn", 'unknown series "sheep_eatn"; did you mean "sheep_eaten"?'),
     ("plot {tmp}/logged -y critic_loss", 'unknown series "critic_loss"; did you mean "train/critic_loss"?'),
     ("plot {tmp}/logged -y train/critic_los", 'unknown TensorBoard tag "train/critic_los"; did you mean "train/critic_loss"?'),
@@ -321,7 +324,7 @@ REFUSED = [
     ("plot {tmp}/apart", "MADDPG on Grassland-v0: no evaluation of its 2 runs was at the same env step"),
     ("plot {tmp}/apart -y train/loss", "MADDPG on Grassland-v0: its 2 runs have logged at no time in common"),
     ("plot {tmp}/logged -x time", "0.monitor.csv has no episode yet"),
-    ("plot {logs} -o {tmp}/file/curve", "the picture cannot be written to {tmp}/file/curve.png: "),
+    ("plot {logs} -o {tmp}/file/curve", "{tmp}/file/curve.png cannot be written: "),
     ("compare {logs} --metric sheep_eatn", 'unknown metric "sheep_eatn"; did you mean "sheep_eaten"?'),
     ("compare {logs}/maddpg", "a comparison takes two, and there is only MADDPG"),
     ("compare {logs} --metric sheep_eaten", "a comparison takes two, and there is only KFCV-MADDPG"),
@@ -332,7 +335,7 @@ REFUSED = [
     ("compare {logs} --scores {tmp}/none.yml", "cannot read {tmp}/none.yml"),
     ("compare {logs} --scores {tmp}/scores.yml", "{tmp}/scores.yml says nothing about HardSpread-v0; it has Grassland-v0"),
     ("compare {logs} --scores {tmp}/same.yml", "Grassland-v0 must be a map of two different numbers, low and high; it is "),
-    ("compare {logs} -o {tmp}/file", "the results cannot be written to {tmp}/file: "),
+    ("compare {logs} -o {tmp}/file", "{tmp}/file/compare.json cannot be written: "),
 ]
 
 
@@ -344,6 +347,7 @@ def bad(tmp_path, logs):
         toy_run(tmp_path / "apart", seed=seed, steps=(100 + seed, 200 + seed), scalars={"train/loss": {seed: 1.0}})
     toy_run(tmp_path / "logged", scalars={"train/critic_loss": {1: 1.0}})
     (tmp_path / "file").touch()
+    (tmp_path / "folder.png").mkdir()
     for name, high in (("scores", 1), ("same", 0)):
         (tmp_path / f"{name}.yml").write_text(yaml.safe_dump({"Grassland-v0": {"low": 0, "high": high}}))
     return tmp_path
@@ -487,7 +491,7 @@ def test_marl_eval_reads_it(tmp_path, capsys):
     compared(tmp_path, tmp_path / "logs", "--point", "best")
     raw = json.loads((tmp_path / "compare" / "marl_eval.json").read_text())
     assert list(raw) == ["sb3_kfcv"] and list(raw["sb3_kfcv"]) == ["grassland-v0", "hardspread-v0"]
-    assert raw["sb3_kfcv"]["grassland-v0"]["PER-MADDPG"]["seed_1"] == {
+    assert raw["sb3_kfcv"]["grassland-v0"]["per-maddpg"]["seed_1"] == {
         "step_0": {"step_count": 100, "reward": [2, 2]},
         "step_1": {"step_count": 200, "reward": [0.5, 1.5]},
         "absolute_metrics": {"reward": [2, 2]},
@@ -498,8 +502,16 @@ def test_marl_eval_reads_it(tmp_path, capsys):
     compared(tmp_path, tmp_path / "logs")
     raw = json.loads((tmp_path / "compare" / "marl_eval.json").read_text())
     assert list(raw) == ["grassland-v0", "hardspread-v0"]  # of other lengths, so no tasks of one environment
-    assert list(raw["hardspread-v0"]["hardspread-v0"]["PER-MADDPG"]) == ["seed_0", "seed_1", "seed_0_3"]
+    assert list(raw["hardspread-v0"]["hardspread-v0"]["per-maddpg"]) == ["seed_0", "seed_1", "seed_0_3"]
     assert "note: HardSpread-v0: marl-eval wants the same seeds and as many evaluations of each" in capsys.readouterr().err
+
+
+def test_marl_eval_refuses_commas_in_names_of_algorithms(tmp_path):
+    for gamma in (0.9, 0.99):
+        toy_run(tmp_path / "logs", config={"gamma": gamma})
+    compared(tmp_path, tmp_path / "logs", "--group-by", "gamma")
+    raw = json.loads((tmp_path / "compare" / "marl_eval.json").read_text())
+    assert list(raw["sb3_kfcv"]["grassland-v0"]) == ["maddpg gamma 0.9", "maddpg gamma 0.99"]
 
 
 def test_real_runs_are_drawn_and_compared(tmp_path, capsys):

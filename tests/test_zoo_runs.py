@@ -9,6 +9,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from tests.toy_runs import toy_run
 from zoo import train
+from zoo.named_players import label_of, run_of
+from zoo.run_folder import file_to_play
 from zoo.runs import Run, find_runs, natural, pick_run, runs_below
 from zoo.series import evaluation_files, evaluations, progress, tensorboard_series
 
@@ -93,6 +95,71 @@ def test_what_cannot_be_picked_is_told_with_what_there_is(logs, wanted, message)
 def test_an_empty_log_folder_has_nothing_to_pick(tmp_path):
     with pytest.raises(ValueError, match="there is no run in"):
         pick_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "content"), [("config.yml", None), ("args.yml", "{"), ("args.yml", "algo: maddpg\nseed: 0\n"), ("args.yml", "1")]
+)
+def test_a_damaged_run_among_many_is_left_out_and_refused_by_its_own_name(tmp_path, capsys, file, content):
+    toy_run(tmp_path)
+    damaged = toy_run(tmp_path, seed=1)
+    if content is None:
+        (damaged / "Grassland-v0" / file).unlink()
+    else:
+        (damaged / "Grassland-v0" / file).write_text(content)
+    for word in (tmp_path, tmp_path / "maddpg" / "*"):
+        assert names(find_runs([str(word)])) == ["maddpg/Grassland-v0_1"]
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"note: {damaged} is left out: ") and file in line
+    with pytest.raises(ValueError, match=rf"Grassland-v0/{file}"):
+        find_runs([str(damaged)])
+
+
+@pytest.mark.parametrize("content", ["{", "lr: 1\n", "algo: maddpg\nenv: HardSpread-v0\nseed: 0\n"])
+def test_a_foreign_folder_is_no_run(tmp_path, capsys, content):
+    run = toy_run(tmp_path)
+    for folder in (tmp_path, run):
+        (folder / "cfg").mkdir()
+        (folder / "cfg" / "args.yml").write_text(content)
+    assert names(find_runs([str(tmp_path)])) == names(find_runs([str(run)])) == ["maddpg/Grassland-v0_1"]
+    (tmp_path / "m.zip").touch()
+    assert run_of(str(tmp_path / "m.zip")) is None
+    assert label_of(str(tmp_path / "m.zip")) == "m"
+    assert capsys.readouterr().err == ""
+    with pytest.raises(ValueError, match="is no folder of a run"):
+        Run.at(tmp_path)
+
+
+def test_what_can_play_is_picked_to_play(tmp_path, capsys):
+    able, latest = toy_run(tmp_path), toy_run(tmp_path, seed=1)
+    for when, run in enumerate((able, latest)):
+        os.utime(run / "Grassland-v0" / "args.yml", (when, when))
+    assert pick_run(tmp_path, to_play=True).folder.path == latest  # for want of any
+    (able / "rl_model_40_steps.zip").touch()
+    assert pick_run(tmp_path).folder.path == latest
+    assert capsys.readouterr().err == ""
+    assert pick_run(tmp_path, to_play=True).folder.path == able
+    assert capsys.readouterr().err == f"note: {latest} has nothing to play yet; {able} plays\n"
+
+
+@pytest.mark.parametrize(
+    ("given", "nearest"),
+    [
+        ("madpg/Grassland-v0_1", "maddpg/Grassland-v0_1"),
+        ("maddpg/Graslnd-v0_1", "maddpg/Grassland-v0_1"),
+        ("maddpg/Grassland-v0_1/modle.zip", "maddpg/Grassland-v0_1/model.zip"),
+        ("maddpg/Graslnd-v0_1/model.zip", "maddpg/Grassland-v0_1/model.zip"),
+        ("maddpg/Grassland-v0_1/model.zop", "maddpg/Grassland-v0_1/model.zip"),
+        ("maddpg/Grassland-v0_1/unlike.zip", None),
+    ],
+)
+def test_a_misspelt_path_gets_the_nearest_one(tmp_path, given, nearest):
+    (toy_run(tmp_path) / "model.zip").touch()
+    find = [file_to_play] if given.endswith(("zip", "zop")) else [file_to_play, Run.at]
+    for own in find:
+        with pytest.raises(ValueError) as error:
+            own(tmp_path / given)
+        assert str(error.value).endswith(f'did you mean "{tmp_path / nearest}"?' if nearest else "to take a player of")
 
 
 def test_natural_order():

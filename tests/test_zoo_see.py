@@ -11,9 +11,12 @@ from scipy import stats
 from toy_envs import ToyParallelEnv
 
 from sb3_kfcv import MADDPG, load_normalization, make_vec_env
+from sb3_kfcv.common.evaluation import Interval
 from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import layout_of
+from tests.toy_runs import toy_run
 from zoo import enjoy, evaluate, record_video, recording, train
+from zoo.match_results import shown
 from zoo.playing import require_pictures
 from zoo.worlds import World
 
@@ -301,6 +304,41 @@ def test_worlds_that_draw_themselves(tmp_path):
     assert (info["terminal_picture"] != env.get_images()[0]).any()
 
 
+@pytest.mark.parametrize(("fps", "own", "milliseconds"), [(10, 10, 100), (30, 100 / 3, 30), (50, 50, 20), (1000, 50, 20)])
+def test_a_gif_is_as_fast_as_gifs_can_be(tmp_path, fps, own, milliseconds):
+    assert recording.gif_fps(fps) == pytest.approx(own)
+    recording.save_gif([np.full((4, 4, 3), 60 * i, dtype=np.uint8) for i in range(3)], tmp_path / "x.gif", fps)
+    with Image.open(tmp_path / "x.gif") as film:
+        assert [frame.info["duration"] for frame in ImageSequence.Iterator(film)] == [milliseconds] * 3
+
+
+def test_the_length_that_is_told_is_that_of_the_file(tmp_path, logs, capsys):
+    file = tmp_path / "x.gif"
+    assert record_video.main([str(run(logs, 1)), "-n", "1", "-o", str(file), "--fps", "200"]) == 0
+    told = capsys.readouterr()
+    with Image.open(file) as film:
+        seconds = sum(frame.info["duration"] for frame in ImageSequence.Iterator(film)) / 1000
+    assert f", {seconds:.1f} s, " in told.out and seconds >= 0.2
+    assert told.err == f"note: {file}: a GIF shows 50 frames per second at most, not 200\n"
+
+
+def test_a_disk_that_is_full_in_the_end_is_told_in_one_sentence(tmp_path, logs, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(evaluate, "write_json", full)
+    assert evaluate.main([str(run(logs, 1)), "-n", "1", "--json", str(tmp_path / "x.json")]) == 2
+    told = capsys.readouterr()
+    assert told.err == f"error: {tmp_path / 'x.json'} cannot be written: No space left on device\n"
+    assert "return_wolf" in told.out
+
+
+def test_nothing_is_shown_as_minus_zero():
+    assert shown(Interval(-0.001, -0.004, 0.002)) == "0.00 [0.00, 0.00]"
+    assert shown(Interval(-0.04, -0.06, -0.02), 1) == "0.0 [-0.1, 0.0]"
+    assert str(Interval(-0.001, -0.011, 0.009)) == "0.00 ± 0.01"
+
+
 def test_a_world_that_draws_nothing_is_refused():
     arena = recording.Arena(make_vec_env(ToyParallelEnv))
     with pytest.raises(ValueError, match=r"toy draws no pictures; zoo/enjoy\.py --no-render tells its numbers"):
@@ -330,6 +368,9 @@ def bad(tmp_path_factory, logs):
     shutil.copy(run(logs, 2) / "players" / "wolf_80_steps.zip", folder / "alone.zip")
     other = make_vec_env("Grassland-v0", env_kwargs={"n_wolves": 1, "n_sheep": 1})
     MADDPG("MlpPolicy", other, buffer_size=100, learning_starts=1, batch_size=2).save(folder / "other.zip")
+    (folder / "folder.json").mkdir()
+    for world in ("Grassland-v0", "HardSpread-v0"):
+        toy_run(folder / "worlds", env=world)
     shutil.copytree(run(logs, 1) / "Grassland-v0", folder / "begun" / "maddpg" / "Grassland-v0_1" / "Grassland-v0")
     return folder
 
@@ -368,14 +409,23 @@ REFUSED = [
     (evaluate, "{one} --seed -1", "--seed must be a whole number of at least 0, got -1"),
     (evaluate, "{one} --jsn x", 'unknown flag "--jsn"; did you mean "--json"?'),
     (evaluate, "{one} --json table.txt", "--json writes a file that ends in .json, not table.txt"),
-    (evaluate, "{one} --json {tmp}/damaged.zip/x.json", "the results cannot be written"),
+    (evaluate, "{one} --json {tmp}/damaged.zip/x.json", "{tmp}/damaged.zip/x.json cannot be written: "),
+    (evaluate, "{one} --json {tmp}/folder.json", "{tmp}/folder.json cannot be written: Is a directory"),
+    (evaluate, "{one} --json /proc/x.json", "/proc/x.json cannot be written: "),
+    (evaluate, "{tmp}/worlds", "the runs are of several worlds; say with --env in which to play: Grassland-v0, HardSpread-v0"),
+    (evaluate, "{tmp}/alone.zop", 'there is no file {tmp}/alone.zop to take a player of; did you mean "{tmp}/alone.zip"?'),
+    (evaluate, "alone.zop", "there is no file alone.zop to take a player of"),
+    (evaluate, "{one} --team wolf=alone.zop", "there is no file alone.zop to take a player of"),
     (enjoy, "{one} {two}", "name one player to watch, not maddpg_1, maddpg_2; against each other they play by --team"),
     (enjoy, "{one} -n 0", "-n must be a whole number of at least 1, got 0"),
     (enjoy, "{one} --fps 0", "--fps must be above 0, got 0.0"),
     (enjoy, "{one} --stochastic --deterministic", "--deterministic and --stochastic exclude each other"),
     (enjoy, "{one} --metrics eaten", 'unknown metric "eaten"; did you mean "sheep_eaten"?'),
-    (record_video, "{one} -o wolves.giv", 'wolves.giv: unknown kind of film ".giv"; did you mean ".gif"?'),
-    (record_video, "{one} -o {tmp}/damaged.zip/x.gif", "the film cannot be written"),
+    (record_video, "{one} -o wolves.giv", "wolves.giv: a film ends in .mp4 or .gif"),
+    (record_video, "{one} -o {tmp}/damaged.zip/x.gif", "{tmp}/damaged.zip/x.gif cannot be written: "),
+    (record_video, "{one} -o wolves.avi", "wolves.avi: a film ends in .mp4 or .gif"),
+    (record_video, "{one} -o /proc/x.gif", "/proc/x.gif cannot be written: "),
+    (record_video, "{one} --fps inf", "--fps must be above 0 and at most 1000, got inf"),
     (record_video, "{one} --grid 2+3", '--grid takes ROWSxCOLUMNS, such as 2x3; got "2+3"'),
     (record_video, "{one} --grid 2x2 -n 5", "--grid 2x2 holds 4 episodes, not 5"),
     (record_video, "{one} -n 0", "-n must be a whole number of at least 1, got 0"),

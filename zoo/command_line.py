@@ -7,7 +7,10 @@ import shlex
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from errno import EISDIR
+from os import strerror
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, NoReturn
 
 import gymnasium as gym
@@ -100,6 +103,28 @@ def as_it_was_typed(name: str, argv: Sequence[str] | None) -> str:
     :param argv: its words; by default those of the process
     """
     return shlex.join([*this_command(name), *(sys.argv[1:] if argv is None else argv)])
+
+
+def require_writable(*files: str | Path) -> None:
+    """
+    Make the folders of files that are to be written, and see that they can be, before time is spent.
+
+    :raises ValueError: if one cannot
+    """
+    for file in map(Path, files):
+        try:
+            if file.is_dir():
+                raise IsADirectoryError(EISDIR, strerror(EISDIR))
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with TemporaryFile(dir=file.parent):
+                pass
+        except OSError as error:
+            raise ValueError(unwritable(file, error)) from None
+
+
+def unwritable(path: str | Path, error: OSError) -> str:
+    """Why a file or folder cannot be written, in one sentence."""
+    return f"{path} cannot be written: {error.strerror or error}"
 
 
 def refused(error: Exception) -> int:

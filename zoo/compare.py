@@ -18,7 +18,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import e
 
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.saving.archive import library_versions
-from zoo.command_line import REFUSALS, SEVERAL, Parser, as_it_was_typed, refused, start, whole_number
+from zoo.command_line import (
+    REFUSALS,
+    SEVERAL,
+    Parser,
+    as_it_was_typed,
+    refused,
+    require_writable,
+    start,
+    unwritable,
+    whole_number,
+)
 from zoo.compare_results import Comparison, Outcome, as_markdown_page, as_report, as_screen, draw, marl_eval
 from zoo.match_results import write_json, write_text
 from zoo.run_folder import read_map
@@ -37,6 +47,8 @@ EXAMPLES = (
 )
 
 LAST, BEST = "last", "best"
+
+FILES = ("compare.json", "compare.md", "marl_eval.json", "compare.png")
 
 
 def make_parser() -> Parser:
@@ -213,17 +225,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = make_parser().parse_all(argv)
         comparison = build(args)
+        folder = Path(args.output)
+        require_writable(*(folder / name for name in FILES))
     except REFUSALS as error:
         return refused(error)
     about = {"command": as_it_was_typed("compare", argv), "versions": library_versions()}
-    folder = Path(args.output)
+    report, page, raw, picture = (folder / name for name in FILES)
     try:
-        write_json(folder / "compare.json", as_report(comparison, about))
-        write_text(folder / "compare.md", as_markdown_page(comparison, about))
-        write_json(folder / "marl_eval.json", marl_eval(comparison))
-        draw(comparison, folder / "compare.png")
+        write_json(report, as_report(comparison, about))
+        write_text(page, as_markdown_page(comparison, about))
+        write_json(raw, marl_eval(comparison))
+        draw(comparison, picture)
     except OSError as error:
-        return refused(OSError(f"the results cannot be written to {folder}: {error.strerror}"))
+        return refused(OSError(unwritable(folder, error)))
     print(as_screen(comparison))
     print(f"written: {folder / 'compare.md'}, .json and .png, and {folder / 'marl_eval.json'}")
     return 0

@@ -352,22 +352,23 @@ def draw(comparison: Comparison, path: Path) -> None:
     title = "IQM over seeds (circles), 95 % bootstrap intervals"
     height = max(3.8, HEIGHT_OF_LABEL * max(len(comparison.labels), len(pairs)))
     figure, axes = new_figure(len(comparison.worlds) + several + 2, title, (5.2, height))
+    measured = metric_label(comparison.metric, comparison.eval_name) + (" (lower is better)" if comparison.sign < 0 else "")
     for axis, (world, groups) in zip(axes, comparison.worlds.items(), strict=False):
         intervals = {group.label: comparison.interval(group) for group in groups}
         draw_estimates(axis, intervals, colours, {group.label: comparison.values(group) for group in groups})
         axis.set_title(world)
-        axis.set_xlabel(metric_label(comparison.metric, comparison.eval_name))
+        axis.set_xlabel(measured)
     if several:
         every = {label: np.concatenate([*own.values()]) for label, own in comparison.scores.items()}
         draw_estimates(axes[-3], comparison.overall, colours, every)
         axes[-3].set_title("all worlds")
-        axes[-3].set_xlabel("normalised score")
+        axes[-3].set_xlabel("normalised score (higher is better)")
     for label, shares in comparison.profiles.items():
         draw_intervals(axes[-2], comparison.thresholds, shares, colours[label], wrapped(label), styles[label][1])
     axes[-2].set_title("performance profile")
     axes[-2].set_xlabel("normalised score τ")
     axes[-2].set_ylabel("share of runs above τ")
-    draw_legend(axes[-2])
+    draw_legend(axes[-2], below=True)
     labelled = {f"{own.better}\n> {own.than}": own for own in pairs}
     intervals = {label: own.probability for label, own in labelled.items()}
     draw_estimates(axes[-1], intervals, {label: colours[own.better] for label, own in labelled.items()})
@@ -384,7 +385,7 @@ def marl_eval(comparison: Comparison) -> dict[str, Any]:
     """
     The episodes of all evaluations, as marl-eval reads them: environment → task → algorithm → run → ``step_<i>``, each with
     its ``step_count`` and the metric of each episode, and ``absolute_metrics``: the episodes that count here. Names are in
-    lower case, as marl-eval looks them up.
+    lower case, as marl-eval looks them up, and those of algorithms without the commas that it refuses.
 
     The tasks of one environment must have the same number of evaluations there. Worlds that have are tasks of ``sb3_kfcv``;
     else each is an environment of its own.
@@ -394,7 +395,7 @@ def marl_eval(comparison: Comparison) -> dict[str, Any]:
     for world, groups in comparison.worlds.items():
         task = world.lower()
         tasks = found.setdefault("sb3_kfcv" if len(lengths) == 1 else task, {})
-        tasks[task] = {group.label: _runs(comparison, group) for group in groups}
+        tasks[task] = {group.label.lower().replace(",", ""): _runs(comparison, group) for group in groups}
     return found
 
 

@@ -18,7 +18,7 @@ import torch as th
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import each other as the package ``zoo``
 
 from sb3_kfcv.common.checks import require_between, require_count
-from sb3_kfcv.common.evaluation import Interval
+from sb3_kfcv.common.evaluation import Interval, rounded
 from sb3_kfcv.envs.parallel_env import Window
 from sb3_kfcv.matches.pay_off import interval_of, shares_of
 from zoo.command_line import INTERRUPTED, REFUSALS, Parser, refused, start, whole_number
@@ -111,7 +111,7 @@ def watch(
         for i in range(n_episodes):
             played = arena.play(cast.players, 1, seed + i, deterministic, camera).quantities()
             episodes.append({name: float(values[0]) for name, values in played.items()})
-            cells = [f"{episodes[-1][name]:{max(len(name), 6)}.2f}" for name in names]
+            cells = [f"{rounded(episodes[-1][name]):{max(len(name), 6)}.2f}" for name in names]
             print("  ".join([f"{i + 1:7}", f"{seed + i:4}", *cells]), flush=True)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

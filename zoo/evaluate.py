@@ -21,7 +21,7 @@ from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.evaluation import Interval
 from sb3_kfcv.matches.pay_off import interval_of, shares_of
 from sb3_kfcv.saving.archive import library_versions
-from zoo.command_line import REFUSALS, Parser, as_it_was_typed, refused, start, whole_number
+from zoo.command_line import REFUSALS, Parser, as_it_was_typed, refused, require_writable, start, unwritable, whole_number
 from zoo.match import progress_line
 from zoo.match_results import as_text, shown, write_json
 from zoo.playing import Cast, Playing, add_players, check_metrics, check_players, in_words, main_quantities, playing
@@ -82,13 +82,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = make_parser().parse_all(argv)
         measured = build(args)
-        for name in (args.json, args.episodes):
-            if name is not None:
-                Path(name).parent.mkdir(parents=True, exist_ok=True)
+        require_writable(*(name for name in (args.json, args.episodes) if name is not None))
     except REFUSALS as error:
         return refused(error)
-    except OSError as error:
-        return refused(OSError(f"the results cannot be written: {error.strerror}: {error.filename}"))
     values = play(measured, args.n_episodes, args.seed)
     shares = shares_of(measured.arena)
     results = {
@@ -96,22 +92,27 @@ def main(argv: Sequence[str] | None = None) -> int:
         for label, quantities in values.items()
     }
     tell(measured, results, args.metrics, in_words(args.n_episodes, args.seed))
-    if args.json is not None:
-        about = {
-            "command": as_it_was_typed("evaluate", argv),
-            "env": measured.world.env_id,
-            "env_kwargs": measured.world.env_kwargs,
-            "env_wrapper": measured.world.env_wrapper,
-            "seed": args.seed,
-            "n_episodes": args.n_episodes,
-            "versions": library_versions(),
-        }
-        players = [{"player": cast.label, "plays": cast.sources, **results[cast.label]} for cast in measured.casts]
-        write_json(Path(args.json), {**about, "players": players})
-        print(f"written: {args.json}")
-    if args.episodes is not None:
-        write_episodes(Path(args.episodes), values, args.seed)
-        print(f"written: {args.episodes}")
+    about = {
+        "command": as_it_was_typed("evaluate", argv),
+        "env": measured.world.env_id,
+        "env_kwargs": measured.world.env_kwargs,
+        "env_wrapper": measured.world.env_wrapper,
+        "seed": args.seed,
+        "n_episodes": args.n_episodes,
+        "versions": library_versions(),
+    }
+    players = [{"player": cast.label, "plays": cast.sources, **results[cast.label]} for cast in measured.casts]
+    writers = {
+        args.json: lambda: write_json(Path(args.json), {**about, "players": players}),
+        args.episodes: lambda: write_episodes(Path(args.episodes), values, args.seed),
+    }
+    for name, write in writers.items():
+        if name is not None:
+            try:
+                write()
+            except OSError as error:
+                return refused(OSError(unwritable(name, error)))
+            print(f"written: {name}")
     return 0
 
 

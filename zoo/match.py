@@ -27,7 +27,18 @@ from sb3_kfcv.matches import Arena, PayOffTable, Side, curve, pay_off_table
 from sb3_kfcv.matches.pay_off import interval_of, shares_of
 from sb3_kfcv.saving.archive import FileFormatError, library_versions
 from sb3_kfcv.teams.players import scripted_for
-from zoo.command_line import PAIRS, REFUSALS, SEVERAL, Parser, as_it_was_typed, refused, start, whole_number
+from zoo.command_line import (
+    PAIRS,
+    REFUSALS,
+    SEVERAL,
+    Parser,
+    as_it_was_typed,
+    refused,
+    require_writable,
+    start,
+    unwritable,
+    whole_number,
+)
 from zoo.match_results import Curve, Ratings, as_text, described, shown, table_lines, write_curves, write_table
 from zoo.named_players import found, label_of, labelled, parse_team, run_of
 from zoo.run_folder import RunFolder
@@ -257,11 +268,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         args = make_parser().parse_all(argv)
         matches = build(args)
         folder = Path(args.output)
-        folder.mkdir(parents=True, exist_ok=True)
+        require_writable(folder / "match.json", folder / "curve.json")
     except REFUSALS as error:
         return refused(error)
-    except OSError as error:
-        return refused(OSError(f"the results cannot be written to {args.output}: {error.strerror}"))
     about = {
         "command": as_it_was_typed("match", argv),
         "env": matches.world.env_id,
@@ -271,10 +280,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         "players": matches.sources,
         "versions": library_versions(),
     }
-    if args.team or not args.curve:
-        make_table(matches, about, folder)
-    if args.curve:
-        make_curves(matches, {**about, "group": matches.trained, "against": args.against}, folder)
+    try:
+        if args.team or not args.curve:
+            make_table(matches, about, folder)
+        if args.curve:
+            make_curves(matches, {**about, "group": matches.trained, "against": args.against}, folder)
+    except OSError as error:
+        return refused(OSError(unwritable(folder, error)))
     return 0
 
 

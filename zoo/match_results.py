@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_kfcv.common.evaluation import Interval
+from sb3_kfcv.common.evaluation import Interval, rounded
 from sb3_kfcv.matches import Elo, Equilibrium, PayOffTable, elo, equilibrium
 from sb3_kfcv.saving.files import atomic_write
 from zoo.plots import (
@@ -40,8 +40,11 @@ def table_lines(table: PayOffTable, quantity: str) -> list[list[str]]:
 
 
 def shown(cell: Interval, decimals: int = 2) -> str:
-    """A mean and its interval, such as ``0.85 [0.79, 0.89]``."""
-    mean, low, high = (f"{value:.{decimals}f}" for value in cell)
+    """
+    A mean and its interval, such as ``0.85 [0.79, 0.89]``. Intervals of means are Student's, which know no bounds: of what is
+    never negative, such as a count, the lower end may be.
+    """
+    mean, low, high = (f"{rounded(value, decimals):.{decimals}f}" for value in cell)
     return mean + (f" [{low}, {high}]" if math.isfinite(cell.low) else "")
 
 
@@ -90,7 +93,7 @@ class Ratings:
             sign = -1 if group == self.table.row_group else 1
             for one in sorted(players, key=lambda player: sign * player["pay_off"]):
                 rating = [f"{one['elo'].mean:.0f} ± {one['elo'].high - one['elo'].mean:.0f}"] if self.elo else []
-                lines.append([group, one["player"], *rating, f"{one['share']:.2f}", f"{one['pay_off']:.2f}"])
+                lines.append([group, one["player"], *rating, f"{one['share']:.2f}", f"{rounded(one['pay_off']):.2f}"])
         return lines
 
 

@@ -50,21 +50,27 @@ def found(player: str, group: str, best: bool = False) -> list[str]:
         paths = sorted(glob.glob(player), key=natural)
         if not paths:
             raise ValueError(f'no file and no folder matches "{player}"')
-    return [str(file_to_play(path, group if best else None)) if is_path(path) else path for path in paths]
+    return [str(file_to_play(path, group if best else None)) if is_named(path) else path for path in paths]
 
 
 def run_of(word: str) -> Run | None:
     """The run that a folder or file belongs to, if it does to one."""
     path = Path(word)
-    for folder in (path, path.parent, path.parent.parent):
-        if is_file(word) and len(list(folder.glob("*/args.yml"))) == 1:
-            return Run.at(folder)
+    for place in (path, path.parent, path.parent.parent) if is_file(word) else ():
+        folder = RunFolder.at(place)
+        if folder is not None:
+            return Run(folder)
     return None
 
 
 def is_file(word: str) -> bool:
     """Whether a word means a file or folder, not a scripted policy."""
     return "," not in word and (is_path(word) or Path(word).is_dir())
+
+
+def is_named(word: str) -> bool:
+    """Whether a word means a file or folder, even if there is none: no scripted policy has an ending."""
+    return is_path(word) or Path(word).suffix != ""
 
 
 def label_of(player: str) -> str:
@@ -79,12 +85,13 @@ def label_of(player: str) -> str:
     if not is_path(player):
         return player
     path = Path(player).resolve()
-    folder = path.parent.parent if path.parent.name == "players" else path.parent
-    if not list(folder.glob("*/args.yml")):
+    place = path.parent.parent if path.parent.name == "players" else path.parent
+    folder = RunFolder.at(place)
+    if folder is None:
         return path.stem
-    run = f"{folder.parent.name}_{folder.name.rpartition('_')[2]}"
+    run = f"{place.parent.name}_{place.name.rpartition('_')[2]}"
     steps = re.search(r"_(\d+)(_steps)?\.zip$", path.name)
-    if path == RunFolder.existing(folder).last_model.resolve():
+    if path == folder.last_model.resolve():
         return run
     return f"{run}@{steps.group(1)}" if steps else f"{run} {path.stem.removesuffix('_model')}"
 

@@ -25,7 +25,7 @@ from sb3_kfcv.saving.normalization import load_normalization
 from sb3_kfcv.teams.players import PLAYER_KINDS, Mixture, load_player, roles_in, scripted_for
 from sb3_kfcv.vec_env.make import layout_of
 from zoo.command_line import PAIRS, SEVERAL, Parser, whole_number
-from zoo.named_players import found, is_file, label_of, labelled, parse_team, run_of
+from zoo.named_players import found, is_file, is_named, label_of, labelled, parse_team, run_of
 from zoo.run_folder import RunFolder, file_to_play
 from zoo.runs import Run, natural, pick_run, runs_below
 from zoo.worlds import World, find_world
@@ -175,7 +175,7 @@ def playing(args: argparse.Namespace, n_envs: int, drawn: bool = False) -> Playi
     in_team = [word.partition("=")[2] for word in args.team]
     runs = [run for word in [*words, *in_team] if (run := run_of(word)) is not None]
     if not words and not _is_complete(args, runs):
-        picked = pick_run(args.folder, args.algo, args.env, args.exp_id)
+        picked = pick_run(args.folder, args.algo, args.env, args.exp_id, to_play=True)
         words, runs = [str(picked.folder.path)], [picked, *runs]
     world = find_world(args, runs, words)
     arena = Arena(world.make(n_envs, drawn))
@@ -209,8 +209,8 @@ def _expanded(word: str, args: argparse.Namespace) -> list[str]:
         if Path(path).is_dir() and not runs:
             raise ValueError(f"there is no run of zoo/train.py in {path}")
         runs = [run for run in runs if args.algo in (None, run.algo) and args.env in (None, run.env_id)] or runs[:1]
-        if is_path(path) and not Path(path).is_dir() and not existing(Path(path)).is_file():
-            (file_to_play if path.endswith(".zip") else RunFolder.existing)(path)  # say what there is instead
+        if "," not in path and is_named(path) and not Path(path).is_dir() and not existing(Path(path)).is_file():
+            (file_to_play if Path(path).suffix else RunFolder.existing)(path)  # say what there is instead
         expanded += [str(run.folder.path) for run in runs] or [path]
     return expanded
 

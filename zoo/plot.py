@@ -26,10 +26,22 @@ from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.evaluation import Interval, with_interval
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.saving.files import with_suffix
-from zoo.command_line import REFUSALS, SEVERAL, Parser, as_it_was_typed, refused, start
+from zoo.command_line import REFUSALS, SEVERAL, Parser, as_it_was_typed, refused, require_writable, start, unwritable
 from zoo.match_results import shown, write_json
 from zoo.plots import draw_intervals, draw_legend, line_styles, new_figure, save_figure
-from zoo.run_groups import REWARD, Group, doubts, grouped, metric_label, metrics_of, note, of_each, only, progress_of, too_few
+from zoo.run_groups import (
+    REWARD,
+    Group,
+    doubts,
+    grouped,
+    metric_label,
+    metrics_of,
+    note,
+    of_each,
+    only,
+    progress_of,
+    too_few,
+)
 from zoo.runs import Run, find_runs
 from zoo.series import Series, evaluation_files, tensorboard_series
 from zoo.statistics import iqm_curve
@@ -54,6 +66,8 @@ TIME_UNITS = {"hours": 3600.0, "minutes": 60.0, "seconds": 1.0}  # in seconds; t
 MOST_POINTS = 200
 
 BOOTSTRAP_SEED = 0
+
+LOGGED_REWARD = "rollout/ep_rew_mean"
 
 
 def make_parser() -> Parser:
@@ -124,7 +138,12 @@ def load(runs: Sequence[Run], name: str, eval_name: str) -> dict[Run, tuple[np.n
     metrics = available(runs, lambda run: metrics_of(run, eval_name))
     if metrics and name not in metrics:
         raise ValueError(unknown_name("series", name, {*metrics, *available(runs, logged)}))
-    return of_each(runs, lambda run: metrics_of(run, eval_name), "metric", name)
+    try:
+        return of_each(runs, lambda run: metrics_of(run, eval_name), "metric", name)
+    except ValueError as error:
+        if any(evaluation_files(run.folder.path) for run in runs):
+            raise
+        raise ValueError(f"{error}; try -y {LOGGED_REWARD} (rewards of the training), or --list") from None
 
 
 def is_metric(series: str) -> bool:
@@ -324,6 +343,17 @@ def as_json(lines: Sequence[Line], args: argparse.Namespace, command: str) -> di
     return {"command": command, **about, "lines": drawn}
 
 
+def output(name: str) -> Path:
+    """
+    The file of ``-o``.
+
+    :raises ValueError: for an ending of another kind of picture
+    """
+    if Path(name).suffix not in ("", ".png"):
+        raise ValueError(f"-o writes a file that ends in .png, not {name}")
+    return with_suffix(name, ".png")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """
     The command.
@@ -337,15 +367,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.list:
             print(list_series(find_runs(args.runs)))
             return 0
+        path = output(args.output)
         lines = make_lines(args)
+        require_writable(path, path.with_suffix(".json"))
     except REFUSALS as error:
         return refused(error)
-    path = with_suffix(args.output, ".png")
     try:
         draw(lines, args, path)
         write_json(path.with_suffix(".json"), as_json(lines, args, as_it_was_typed("plot", argv)))
     except OSError as error:
-        return refused(OSError(f"the picture cannot be written to {path}: {error.strerror}"))
+        return refused(OSError(unwritable(path, error)))
     for line in lines:
         steps, last = line.steps[-1], line.intervals[-1]
         print(f"{line.group.env_id}: {line.label}: {shown(last)} after {steps:,.0f} env steps")

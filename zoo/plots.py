@@ -14,7 +14,7 @@ from matplotlib.colors import Normalize, to_hex, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from sb3_kfcv.common.evaluation import Interval, with_interval
+from sb3_kfcv.common.evaluation import Interval, rounded, with_interval
 from sb3_kfcv.saving.files import atomic_write
 
 # Okabe and Ito's colours, which stay apart for colour-blind readers.
@@ -138,9 +138,14 @@ def draw_estimates(
     axis.grid(axis="y", visible=False)
 
 
-def draw_legend(axis: Axes) -> None:
-    """The names of the lines: within the picture where they are few, else below it."""
-    if len(axis.get_legend_handles_labels()[0]) > MOST_WITHIN:
+def draw_legend(axis: Axes, below: bool = False) -> None:
+    """
+    The names of the lines: within the picture where they are few, else below it.
+
+    :param axis: where to draw
+    :param below: below it in any case, where lines take up the whole picture
+    """
+    if below or len(axis.get_legend_handles_labels()[0]) > MOST_WITHIN:
         axis.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.24), ncols=2)
     else:
         axis.legend(fontsize="small")
@@ -174,8 +179,9 @@ def draw_heat_map(
     for i, line in enumerate(intervals):
         for k, cell in enumerate(line):
             ink = "black" if scale(cell.mean) > 0.5 else "white"
-            axis.text(k, i, f"{cell.mean:.2f}", ha="center", va="bottom", color=ink, fontsize=10)
-            axis.text(k, i + 0.06, f"{cell.low:.2f} … {cell.high:.2f}", ha="center", va="top", color=ink, fontsize=7)
+            axis.text(k, i, f"{rounded(cell.mean):.2f}", ha="center", va="bottom", color=ink, fontsize=10)
+            ends = f"{rounded(cell.low):.2f} … {rounded(cell.high):.2f}"
+            axis.text(k, i + 0.06, ends, ha="center", va="top", color=ink, fontsize=7)
     axis.set_xticks(range(len(columns)), columns, rotation=30, ha="right", rotation_mode="anchor")
     axis.set_yticks(range(len(rows)), rows)
     axis.grid(False)

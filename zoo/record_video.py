@@ -17,10 +17,10 @@ import torch as th
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import each other as the package ``zoo``
 
 from sb3_kfcv.common.checks import require_between, require_count
-from sb3_kfcv.common.naming import unknown_name
-from zoo.command_line import REFUSALS, Parser, refused, start, whole_number
+from sb3_kfcv.common.evaluation import rounded
+from zoo.command_line import REFUSALS, Parser, refused, require_writable, start, unwritable, whole_number
 from zoo.playing import Playing, add_players, check_players, in_words, own_fps, playing
-from zoo.recording import film, grid_for, require_moviepy, save_gif, save_mp4
+from zoo.recording import FASTEST_GIF, film, gif_fps, grid_for, require_moviepy, save_gif, save_mp4
 
 DESCRIPTION = """\
 Film episodes side by side, one world each, with the score drawn in: the latest run, a run folder, a file, or a scripted
@@ -35,6 +35,7 @@ EXAMPLES = (
 
 SAVERS: dict[str, Callable[..., None]] = {".mp4": save_mp4, ".gif": save_gif}
 N_EPISODES = 4
+FASTEST = 1000  # frames per second
 
 
 def make_parser() -> Parser:
@@ -79,14 +80,12 @@ def outputs(args: argparse.Namespace) -> list[Path]:
     """
     The files of ``-o``.
 
-    :raises ValueError: for an ending that is neither, a folder, and if what writes an MP4 is missing
+    :raises ValueError: for an ending that is neither, and if what writes an MP4 is missing
     """
     files = [Path(name) for name in args.output]
     for file in files:
         if file.suffix not in SAVERS:
-            raise ValueError(f"{file}: {unknown_name('kind of film', file.suffix, SAVERS)}")
-        if file.is_dir():
-            raise ValueError(f"{file} is a folder")
+            raise ValueError(f"{file}: a film ends in {' or '.join(SAVERS)}")
         if file.suffix == ".mp4":
             require_moviepy()
     return files
@@ -122,19 +121,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         if grid[0] * grid[1] < n_episodes:
             raise ValueError(f"--grid {args.grid} holds {grid[0] * grid[1]} episodes, not {n_episodes}")
         if args.fps is not None:
-            require_between("--fps", args.fps, 0, above=True)
+            require_between("--fps", args.fps, 0, FASTEST, above=True)
         if args.deterministic and args.stochastic:
             raise ValueError("--deterministic and --stochastic exclude each other")
         files = outputs(args)
         filmed = playing(args, n_episodes, drawn=True)
         files = files or default_outputs(filmed, args.seed)
-        for file in files:
-            file.parent.mkdir(parents=True, exist_ok=True)
+        require_writable(*files)
     except REFUSALS as error:
         return refused(error)
+    try:
+        record(filmed, args.seed, grid, not args.stochastic, files, args.fps)
     except OSError as error:
-        return refused(OSError(f"the film cannot be written: {error.strerror}: {error.filename}"))
-    record(filmed, args.seed, grid, not args.stochastic, files, args.fps)
+        return refused(OSError(unwritable("the film", error)))
     return 0
 
 
@@ -160,11 +159,14 @@ def record(
     fps = fps or own_fps(arena)
     print(f"{filmed.world.env_id}: {cast}; {episodes_played}")
     for group, returns in episodes.returns.items():
-        print(f"return per {group}: {'  '.join(f'{value:.2f}' for value in returns)}")
+        print(f"return per {group}: {'  '.join(f'{rounded(value):.2f}' for value in returns)}")
+    height, width, _ = frames[0].shape
     for file in files:
-        SAVERS[file.suffix](frames, file, fps)
-        height, width, _ = frames[0].shape
-        seconds = len(frames) / fps
+        own = gif_fps(fps) if file.suffix == ".gif" else fps
+        if file.suffix == ".gif" and fps > FASTEST_GIF:
+            print(f"note: {file}: a GIF shows {FASTEST_GIF:g} frames per second at most, not {fps:g}", file=sys.stderr)
+        SAVERS[file.suffix](frames, file, own)
+        seconds = len(frames) / own
         print(f"{file}: {width} × {height}, {len(frames)} frames, {seconds:.1f} s, {file.stat().st_size / 1000:,.0f} kB")
 
 

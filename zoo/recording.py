@@ -12,11 +12,14 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from sb3_kfcv.common.evaluation import rounded
 from sb3_kfcv.envs.drawing import Scene, draw, without_caption_strip
 from sb3_kfcv.matches import Arena
 from sb3_kfcv.saving.files import atomic_write
 
 PAUSE = 10  # frames for which the last picture stands still
+FASTEST_GIF = 50.0  # frames per second
+LONGEST_GIF_FRAME = 65_535  # hundredths of a second
 
 PAPER, INK, BORDER, FADED = (255, 255, 255), (40, 44, 52), (140, 144, 150), 0.45
 TITLE_HEIGHT, LINE_HEIGHT, TEXT_HEIGHT, LEAST_TEXT_HEIGHT = 24, 19, 14, 10  # pixels
@@ -120,7 +123,7 @@ class Camera:
             returns = {group: score.metrics[f"return_{group}"] for group in returns}
             picture = Image.blend(Image.new("RGB", picture.size, PAPER), picture, FADED)
         verdict = self._verdict(score.metrics) if score.is_over else ""
-        cells = [*parts, *(f"{self._names[group]} {value:+.2f}" for group, value in returns.items()), verdict]
+        cells = [*parts, *(f"{self._names[group]} {rounded(value):+.2f}" for group, value in returns.items()), verdict]
         top, cell_width = math.ceil(len(cells) / self._columns) * LINE_HEIGHT, self.tile_width // self._columns
         tile = Image.new("RGB", (self.tile_width, top + picture.height), PAPER)
         tile.paste(picture, (0, top))
@@ -209,19 +212,31 @@ def film(
     return frames + frames[-1:] * PAUSE, episodes
 
 
+def gif_fps(fps: float) -> float:
+    """
+    The frames per second of a GIF, which stores how long each stands in hundredths of a second; viewers slow down what stands
+    shorter than two of them.
+
+    :param fps: what is wished for
+    :return: the nearest that there is
+    """
+    return 100 / round(min(max(100 / fps, 100 / FASTEST_GIF), LONGEST_GIF_FRAME))
+
+
 def save_gif(frames: Sequence[np.ndarray], path: str | Path, fps: float) -> None:
     """
     Write frames as an endless GIF.
 
     :param frames: uint8 (height, width, 3)
     :param path: of the file
-    :param fps: frames per second
+    :param fps: frames per second, as near as :func:`gif_fps` can come
     """
     # One palette for all frames: flat colours stay the same from frame to frame, and the file small.
     palette = Image.fromarray(np.concatenate(list(frames[:: max(1, len(frames) // 8)]))).quantize(128)
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    duration = round(1000 / gif_fps(fps))  # milliseconds
     with atomic_write(path) as file:
-        images[0].save(file, format="GIF", save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
+        images[0].save(file, format="GIF", save_all=True, append_images=images[1:], duration=duration, loop=0)
 
 
 def save_mp4(frames: Sequence[np.ndarray], path: str | Path, fps: float) -> None:

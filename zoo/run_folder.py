@@ -6,8 +6,9 @@ import json
 import platform
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -83,13 +84,29 @@ class RunFolder:
         :raises ValueError: if it is none
         """
         path = Path(path)
-        found = sorted(path.glob("*/args.yml"))
-        if len(found) != 1:
-            near = [str(folder.parent.parent) for folder in path.parent.glob("*/*/args.yml")]
+        folder = cls.at(path)
+        if folder is None:
+            near = _runs_near(path)
             raise ValueError(
                 unknown_name("run folder", path, near) if near else f"{path} is no folder of a run of zoo/train.py"
             )
-        return cls(path, read_map(found[0])["env"])
+        return folder
+
+    @classmethod
+    def at(cls, path: str | Path) -> RunFolder | None:
+        """
+        The folder of a run that was begun, if it is one: its ``<env>/args.yml`` is of that world.
+
+        :raises ValueError: if it has the name of a run, and this file is damaged
+        """
+        path = Path(path)
+        for file in sorted(path.glob("*/args.yml")):
+            try:
+                return cls(path, _env_of(file))
+            except ValueError:
+                if path.resolve().name.startswith(f"{file.parent.name}_"):
+                    raise
+        return None
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -108,6 +125,11 @@ class RunFolder:
     def number(self) -> int:
         """k: the how-manieth run of this algorithm in this world it is."""
         return int(self.path.name.rpartition("_")[2])
+
+    @property
+    def can_play(self) -> bool:
+        """Whether it has a model or a checkpoint yet."""
+        return self.last_model.is_file() or bool(checkpoints_in(self.path))
 
     @property
     def last_model(self) -> Path:
@@ -175,7 +197,7 @@ def file_to_play(path: str | Path, best_of: str | None = None) -> Path:
     if file.is_file():
         return file
     if not Path(path).is_dir():
-        raise ValueError(f"there is no file {path} to take a player of")
+        raise ValueError(f"there is no file {path} to take a player of{_or_else(Path(path))}")
     folder = RunFolder.existing(path)
     if best_of is not None:
         for best in (folder.path / f"best_{best_of}.zip", folder.path / "best_model.zip"):
@@ -188,6 +210,43 @@ def file_to_play(path: str | Path, best_of: str | None = None) -> Path:
     if not checkpoints:
         raise ValueError(f"the run in {folder.path} has no model and no checkpoint yet")
     return checkpoints[0]
+
+
+def _env_of(arguments_file: Path) -> str:
+    """
+    The world of a run.
+
+    :param arguments_file: ``<env>/args.yml``
+    :raises ValueError: if it is none of zoo/train.py
+    """
+    arguments = read_map(arguments_file)
+    env_id = arguments.get("env")
+    if isinstance(env_id, str) and file_name(env_id) == arguments_file.parent.name and {"algo", "seed"} <= arguments.keys():
+        return env_id
+    raise ValueError(f"{arguments_file} is no command line of zoo/train.py: it needs algo, env and seed, env as its folder")
+
+
+def _beside(path: Path, pattern: str) -> list[Path]:
+    """What there is beside a path that is none, or, where its folder is none either, in the folders beside that."""
+    return list(path.parent.glob(pattern) if path.parent.is_dir() else path.parent.parent.glob(f"*/{pattern}"))
+
+
+def _runs_near(path: Path) -> list[str]:
+    near = []
+    for file in _beside(path, "*/*/args.yml"):
+        with suppress(ValueError):
+            _env_of(file)
+            near.append(str(file.parent.parent))
+    return near
+
+
+def _or_else(path: Path) -> str:
+    """What may be meant by a path that is none: the nearest file or run, if one is near, by the names that differ."""
+    depth = 1 if path.parent.is_dir() else 2
+    near = [*map(str, _beside(path, "*.zip")), *_runs_near(path)]
+    names = {"/".join(Path(other).parts[-depth:]): other for other in near}
+    close = get_close_matches("/".join(path.parts[-depth:]), names, n=1)
+    return f'; did you mean "{names[close[0]]}"?' if close else ""
 
 
 def file_name(env_id: str) -> str:

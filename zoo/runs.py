@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import glob
 import re
-from collections.abc import Iterable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -90,13 +91,39 @@ class Run:
 def runs_below(path: str | Path) -> list[Run]:
     """
     The runs in a folder: the folder itself if it is one, else all that lie in it, such as in a log folder or in a sweep, in
-    the natural order of their paths.
+    the natural order of their paths. Damaged ones among many are left out, which a note tells.
+
+    :raises ValueError: if the folder itself is a damaged run
     """
     path = Path(path)
-    if list(path.glob("*/args.yml")):
-        return [Run.at(path)]
+    own = _run_in(path)
+    if own:
+        return own
     found = {file.parent.parent for depth in range(2, DEPTH + 1) for file in path.glob("*/" * depth + "args.yml")}
-    return [Run.at(folder) for folder in sorted(found, key=lambda folder: natural(str(folder)))]
+    return [run for folder in sorted(found, key=lambda folder: natural(str(folder))) for run in _or_note(_run_in, folder)]
+
+
+def _run_in(path: Path) -> list[Run]:
+    """
+    The run that a folder is, if it is one.
+
+    :raises ValueError: if it is damaged
+    """
+    folder = RunFolder.at(path)
+    if folder is None:
+        return []
+    run = Run(folder)
+    _ = run.config  # is read here, so that a damaged one is refused or left out before anything is done with it
+    return [run]
+
+
+def _or_note(find: Callable[[Path], list[Run]], path: Path) -> list[Run]:
+    """What is found in a folder that nobody named by itself: nothing if it is damaged, and a note."""
+    try:
+        return find(path)
+    except ValueError as error:
+        print(f"note: {path} is left out: {error}", file=sys.stderr)
+        return []
 
 
 def find_runs(words: Iterable[str]) -> list[Run]:
@@ -104,19 +131,27 @@ def find_runs(words: Iterable[str]) -> list[Run]:
     The runs that words of a command line mean, each once.
 
     :param words: run folders, folders over them, and patterns of either
-    :raises ValueError: for a word that means none
+    :raises ValueError: for a word that means none, and for a damaged run that is named by itself
     """
     runs: dict[Path, Run] = {}
     for word in words:
-        paths = sorted(glob.glob(word), key=natural) if glob.has_magic(word) else [word]
-        found = [run for path in paths for run in runs_below(path)]
+        if glob.has_magic(word):
+            found = [run for path in sorted(glob.glob(word), key=natural) for run in _or_note(runs_below, Path(path))]
+        else:
+            found = runs_below(word)
         if not found:
             raise ValueError(f"there is no run of zoo/train.py in {word}")
         runs.update((run.folder.path.resolve(), run) for run in found)
     return list(runs.values())
 
 
-def pick_run(log_folder: str | Path, algo: str | None = None, env_id: str | None = None, exp_id: int = 0) -> Run:
+def pick_run(
+    log_folder: str | Path,
+    algo: str | None = None,
+    env_id: str | None = None,
+    exp_id: int = 0,
+    to_play: bool = False,
+) -> Run:
     """
     A run of a log folder.
 
@@ -124,6 +159,7 @@ def pick_run(log_folder: str | Path, algo: str | None = None, env_id: str | None
     :param algo: only of this algorithm
     :param env_id: only in this world
     :param exp_id: its number (the k of ``<env>_<k>``); 0 takes the one that was begun last
+    :param to_play: take the last one that has a model or a checkpoint, if any has; a note tells if a later one has none
     :raises ValueError: if there is none, with what there is
     """
     runs = runs_below(log_folder)
@@ -137,7 +173,14 @@ def pick_run(log_folder: str | Path, algo: str | None = None, env_id: str | None
         raise ValueError(
             f"no run in {log_folder} fits; there are {', '.join(str(run.folder.path) for run in fitting or runs)}"
         )
-    return max(numbered, key=lambda run: run.begun)
+    latest = max(numbered, key=lambda run: run.begun)
+    if to_play and not latest.folder.can_play:
+        able = [run for run in numbered if run.folder.can_play]
+        if able:
+            chosen = max(able, key=lambda run: run.begun)
+            print(f"note: {latest.folder.path} has nothing to play yet; {chosen.folder.path} plays", file=sys.stderr)
+            return chosen
+    return latest
 
 
 def natural(text: str) -> list[tuple[int, str]]:

@@ -53,11 +53,14 @@ def find_world(args: argparse.Namespace, runs: Sequence[Run], words: Sequence[st
     :param args: the command line
     :param runs: those that play
     :param words: who else does, for the message
-    :raises ValueError: if nothing says which world, and for settings that it does not have
+    :raises ValueError: if nothing says which world, if the runs are of several, and for settings that it does not have
     """
     of_it = [run for run in runs if args.env in (None, run.env_id)]
     if not of_it and args.env is None:
         raise ValueError(f"say with --env in which world {words[0]} is to play")
+    worlds = list(dict.fromkeys(run.env_id for run in of_it))
+    if len(worlds) > 1:
+        raise ValueError(f"the runs are of several worlds; say with --env in which to play: {', '.join(worlds)}")
     trained_in = [World.of(run) for run in of_it]
     world = trained_in[0] if trained_in else World(args.env)
     for run, other in zip(of_it, trained_in, strict=True):

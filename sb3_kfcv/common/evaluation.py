@@ -13,6 +13,11 @@ from sb3_kfcv.teams.players import JointModel
 CONFIDENCE = 0.95
 
 
+def rounded(value: float, decimals: int = 2) -> float:
+    """A number as it is to be shown with so many decimals: nothing becomes ``-0.00``."""
+    return round(float(value), decimals) + 0.0
+
+
 class Interval(NamedTuple):
     """A mean and its 95 % confidence interval."""
 
@@ -21,7 +26,7 @@ class Interval(NamedTuple):
     high: float
 
     def __str__(self) -> str:
-        return f"{self.mean:.2f} ± {(self.high - self.low) / 2:.2f}"
+        return f"{rounded(self.mean):.2f} ± {(self.high - self.low) / 2:.2f}"
 
 
 def evaluate(policy: JointModel, env: VecEnv, n_episodes: int, deterministic: bool = True) -> dict[str, np.ndarray]:
