@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 import sys
 from collections.abc import Sequence
 
@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     show_warnings_plainly()
     try:
-        return importlib.import_module(f"zoo.{name}").main(words[1:])
+        return pkgutil.resolve_name(f"zoo.{name}:main")(words[1:])  # one of COMMANDS, imported when it is wanted
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130

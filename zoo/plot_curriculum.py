@@ -392,7 +392,8 @@ def _draw_cells(axis: Axes, points: np.ndarray, difficulty: np.ndarray, label: s
     counts, *_ = np.histogram2d(x, y, bins=(edges, edges))
     sums, *_ = np.histogram2d(x, y, bins=(edges, edges), weights=difficulty)
     means = np.where(counts >= FEWEST_IN_A_CELL, sums / np.maximum(counts, 1), np.nan)
-    spread = max(float(np.nanquantile(np.abs(means - MEAN_DIFFICULTY), 0.99)), 0.01)
+    filled = means[np.isfinite(means)]
+    spread = max(float(np.quantile(np.abs(filled - MEAN_DIFFICULTY), 0.99)), 0.01) if len(filled) else MEAN_DIFFICULTY
     scale = Normalize(MEAN_DIFFICULTY - spread, MEAN_DIFFICULTY + spread)
     image = axis.pcolormesh(edges, edges, means.T, cmap=HEAT_MAP, norm=scale)
     axis.set_aspect("equal")
