@@ -11,6 +11,7 @@ import pytest
 from toy_envs import ToyParallelEnv
 
 from sb3_kfcv import MADDPG, make_vec_env
+from sb3_kfcv.teams.players import scripted_for
 from sb3_kfcv.vec_env.make import layout_of
 from sb3_kfcv.vec_env.named_worlds import find_world, world_names
 from sb3_kfcv.vec_env.named_wrappers import find_wrappers, listed_wrappers
@@ -158,6 +159,14 @@ def test_mpe_trains_saves_and_loads(world, continuous_actions, tmp_path):
     np.testing.assert_array_equal(MADDPG.load(tmp_path / "model", env).predict(rows, deterministic=True)[0], actions)
     assert env.action_space.contains(actions[0])
     assert model.replay_buffer.dones.max() == 0  # MPE's episodes end by their time limit
+
+
+@needs_mpe2
+@pytest.mark.parametrize("continuous_actions", [True, False])
+def test_scripts_of_our_worlds_do_not_play_in_others(continuous_actions):
+    """simple_spread has agents with five choices, as Hard Spread has, who see something else."""
+    layout = layout_of(make_vec_env("mpe2/simple_spread_v3", 1, env_kwargs={"continuous_actions": continuous_actions}))
+    assert list(scripted_for(layout, "agent")) == ["random"]
 
 
 @needs_mpe2

@@ -209,10 +209,17 @@ def _scripted(
 
 
 def _is_foreign(layout: AgentLayout, group: str) -> bool:
-    """Whether a group of a familiar name is of another world: in other company, or not by two numbers or five choices."""
+    """
+    Whether a group of a familiar name is of another world: in other company, not by two numbers or five choices, or (agents) not
+    with as much to see as in Hard Spread: 4 numbers of their own, and 2 of each landmark and of each other agent.
+    """
     at_home = {"agent"} if group == "agent" else {"wolf", "sheep"}
-    sizes = {layout.action_sizes[i] for i in layout.members(group)}
-    return not set(layout.group_names) <= at_home or sizes != ({5} if layout.discrete else {2})
+    members = layout.members(group)
+    acting = {layout.action_sizes[i] for i in members}
+    seeing = {layout.obs_sizes[i] for i in members}
+    if group == "agent" and seeing != {4 * len(members) + 2}:
+        return True
+    return not set(layout.group_names) <= at_home or acting != ({5} if layout.discrete else {2})
 
 
 def load_player(path: str | os.PathLike[str], group: str | None = None) -> ActorPolicy:
