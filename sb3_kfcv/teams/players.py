@@ -210,8 +210,8 @@ def _scripted(
 
 def _is_foreign(layout: AgentLayout, group: str) -> bool:
     """
-    Whether a group of a familiar name is of another world: in other company, not by two numbers or five choices, or (agents) not
-    with as much to see as in Hard Spread: 4 numbers of their own, and 2 of each landmark and of each other agent.
+    Whether a group of a familiar name is of another world: in other company, not by two numbers or five choices, or (agents)
+    not with as much to see as in Hard Spread: 4 numbers of their own, and 2 of each landmark and of each other agent.
     """
     at_home = {"agent"} if group == "agent" else {"wolf", "sheep"}
     members = layout.members(group)
