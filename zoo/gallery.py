@@ -10,10 +10,12 @@ import argparse
 import contextlib
 import io
 import shlex
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -160,9 +162,10 @@ def section(env_id: str, runs: Sequence[Run], args: argparse.Namespace, folder: 
     else:
         parts.append(f"None of the runs has evaluations: no curves, and no comparison ({', '.join(paths)}).")
     if len({run.algo for run in measured}) > 1:
-        words = [*own, "-o", str(folder / f"{name}_comparison")]
-        parts += ["### All seeds", block(COMPARE.typed(words), COMPARE.run(words))]
-        parts.append(f"![All seeds in {env_id}](gallery/{name}_comparison/compare.png)")
+        with TemporaryDirectory() as made:  # of which the page shows the table and the picture
+            parts += ["### All seeds", block(COMPARE.typed(own), COMPARE.run([*own, "-o", made]))]
+            shutil.copyfile(Path(made) / "compare.png", folder / f"{name}_comparison.png")
+        parts.append(f"![All seeds in {env_id}](gallery/{name}_comparison.png)")
     if not best:
         return "\n\n".join([*parts, "None of the runs has a model or a checkpoint yet: nothing to measure, and no films."])
     layout = layout_of(World.of(runs[0]).make(1))
