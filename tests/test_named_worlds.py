@@ -190,7 +190,10 @@ def test_algorithms_take_names(tmp_path):
 )
 def test_sisl_trains(name, package, settings):
     pytest.importorskip(package)
-    MADDPG("MlpPolicy", make_vec_env(name, 1, 0, settings), seed=0, **QUICK).learn(40)
+    model = MADDPG("MlpPolicy", make_vec_env(name, 1, 0, settings), seed=0, **QUICK)
+    before = [parameter.clone() for parameter in model.actor.parameters()]
+    model.learn(40)
+    assert any((now != then).any() for now, then in zip(model.actor.parameters(), before, strict=True))
 
 
 # ---- wrappers

@@ -223,12 +223,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         for env_id, runs in worlds.items():
             print(f"{env_id}: {len(runs)} {'run' if len(runs) == 1 else 'runs'} …", flush=True)
             sections.append(section(env_id, runs, args, folder))
+        page = Path(args.output) / "gallery.md"
+        write_text(page, "\n\n".join([head.strip(), *sections]) + "\n")
     except REFUSALS as error:
         return refused(error)
     except OSError as error:
         return refused(OSError(f"the page cannot be written to {args.output}: {error.strerror}"))
-    page = Path(args.output) / "gallery.md"
-    write_text(page, "\n\n".join([head.strip(), *sections]) + "\n")
     print(f"written: {page}")
     return 0
 
