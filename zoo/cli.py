@@ -18,6 +18,7 @@ COMMANDS = {
     "optimize": "search for better hyperparameters",
     "sweep": "many runs from one file, on this machine or on a cluster",
     "gallery": "a page of videos, curves, tables and commands, made from runs",
+    "release": "a small model for playing, with its model card, made of the best of some runs",
     "demo": "three minutes of training, from nothing to a table and a film",
 }
 

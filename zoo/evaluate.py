@@ -86,11 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except REFUSALS as error:
         return refused(error)
     values = play(measured, args.n_episodes, args.seed)
-    shares = shares_of(measured.arena)
-    results = {
-        label: {name: interval_of(own, name in shares) for name, own in quantities.items()}
-        for label, quantities in values.items()
-    }
+    results = intervals(measured, values)
     tell(measured, results, args.metrics, in_words(args.n_episodes, args.seed))
     about = {
         "command": as_it_was_typed("evaluate", argv),
@@ -131,6 +127,21 @@ def play(measured: Playing, n_episodes: int, seed: int) -> dict[str, dict[str, n
             values[cast.label] = measured.arena.play(cast.players, n_episodes, seed).quantities()
             bar.update()
     return values
+
+
+def intervals(measured: Playing, values: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, dict[str, Interval]]:
+    """
+    Means and their intervals.
+
+    :param measured: who plays where
+    :param values: as :func:`play` gave them
+    :return: label → quantity → its interval
+    """
+    shares = shares_of(measured.arena)
+    return {
+        label: {name: interval_of(own, name in shares) for name, own in quantities.items()}
+        for label, quantities in values.items()
+    }
 
 
 def tell(measured: Playing, results: Mapping[str, Mapping[str, Interval]], metrics: Sequence[str], episodes: str) -> None:

@@ -31,8 +31,8 @@ from zoo.command_line import REFUSALS, Parser, as_it_was_typed, refused, start, 
 from zoo.match_results import write_text
 from zoo.plots import ALGO_LABELS
 from zoo.run_folder import file_name
+from zoo.run_groups import rewards
 from zoo.runs import Run, find_runs
-from zoo.series import evaluations
 from zoo.worlds import World
 
 DESCRIPTION = """\
@@ -112,10 +112,8 @@ def plays(run: Run) -> bool:
 
 def last_reward(run: Run) -> float:
     """Mean reward of the last evaluation; −∞ where there is none."""
-    try:
-        return float(np.mean(evaluations(run.folder.path)["results"][-1]))
-    except ValueError:
-        return -np.inf
+    means = rewards(run)
+    return float(means[-1]) if len(means) else -np.inf
 
 
 def best_of_each(runs: Sequence[Run]) -> dict[str, Run]:
@@ -180,7 +178,7 @@ def section(env_id: str, runs: Sequence[Run], args: argparse.Namespace, folder: 
     parts.append(block(EVALUATE.typed(words), EVALUATE.run(words)))
     for algo, run in best.items():
         label = ALGO_LABELS.get(algo, algo)
-        parts.append(f"### {label}\n\nTrained by\n\n    {run.folder.config_file.with_name('command.txt').read_text().strip()}")
+        parts.append(f"### {label}\n\nTrained by\n\n    {run.folder.command}")
         if args.films:
             film = f"{name}_{algo}.gif"
             words = [str(run.folder.path), "-n", str(args.films), "--seed", str(args.seed), "-o", str(folder / film)]

@@ -161,18 +161,40 @@ class RunFolder:
     def config_file(self) -> Path:
         return self.path / file_name(self.env_id) / "config.yml"
 
-    def describe(self, settings: Mapping[str, Any], arguments: Mapping[str, Any], command: str) -> None:
+    @property
+    def best_model(self) -> Path:
+        return self.path / "best_model.zip"
+
+    @property
+    def command(self) -> str:
+        """The command line as it was typed."""
+        return self.config_file.with_name("command.txt").read_text(encoding="utf-8").strip()
+
+    @property
+    def versions(self) -> dict[str, str]:
+        """Versions of Python and the libraries with which it was begun."""
+        return json.loads(self.config_file.with_name("versions.json").read_text(encoding="utf-8"))
+
+    def describe(
+        self,
+        settings: Mapping[str, Any],
+        arguments: Mapping[str, Any],
+        command: str,
+        versions: Mapping[str, str] | None = None,
+    ) -> None:
         """
         Write down how the run was started; the command line last, which makes it a run that can be resumed.
 
         :param settings: the resolved hyperparameters
         :param arguments: the resolved command line
         :param command: as it was typed
+        :param versions: of Python and the libraries; by default those of here
         """
+        versions = versions or {**library_versions(), "platform": platform.platform()}
         texts = {
             "config.yml": _as_yaml(settings),
             "command.txt": command + "\n",
-            "versions.json": json.dumps({**library_versions(), "platform": platform.platform()}, indent=2) + "\n",
+            "versions.json": json.dumps(versions, indent=2) + "\n",
             "args.yml": _as_yaml(arguments),
         }
         for name, text in texts.items():
@@ -181,7 +203,7 @@ class RunFolder:
 
     def versions_changed(self) -> list[str]:
         """Libraries that have another version than when the run was begun, each as ``torch 2.12.0 → 2.13.0``."""
-        then, now = json.loads(self.config_file.with_name("versions.json").read_text()), library_versions()
+        then, now = self.versions, library_versions()
         return [f"{name} {then.get(name)} → {found}" for name, found in now.items() if then.get(name) != found]
 
 

@@ -106,15 +106,20 @@ def settings_of_run(run: Run) -> dict[str, str]:
     return {name: str(value) for name, value in {**flat(run.config), **further}.items()}
 
 
-def doubts(group: Group) -> list[str]:
-    """What may make the runs of a group something else than seeds of one another."""
-    found = []
+def differences(group: Group) -> list[str]:
+    """The settings in which the runs of a group differ beside their seeds, each as ``gamma (0.9, 0.95)``."""
     settings = [settings_of_run(run) for run in group.runs]
-    differing = [
+    return [
         f"{name} ({', '.join(sorted(values))})"
         for name in dict.fromkeys(name for own in settings for name in own)
         if name not in ("n_timesteps", *FURTHER_SETTINGS) and len(values := {own.get(name, "none") for own in settings}) > 1
     ]
+
+
+def doubts(group: Group) -> list[str]:
+    """What may make the runs of a group something else than seeds of one another."""
+    found = []
+    differing = differences(group)
     if differing:
         found.append(f"{group}: the runs differ in {', '.join(differing)}; --group-by tells them apart")
     seeds = [run.seed for run in group.runs]
@@ -154,6 +159,14 @@ def metrics_of(run: Run, eval_name: str) -> dict[str, tuple[np.ndarray, np.ndarr
     arrays = evaluations(run.folder.path, eval_name)
     steps = arrays.pop("timesteps")
     return {METRIC_NAMES.get(name, name): (steps, values.astype(float)) for name, values in arrays.items()}
+
+
+def rewards(run: Run) -> np.ndarray:
+    """The mean reward of each evaluation of a run (evaluations,); empty where there is none."""
+    try:
+        return np.mean(evaluations(run.folder.path)["results"], axis=1)
+    except ValueError:
+        return np.empty(0)
 
 
 def metric_label(metric: str, eval_name: str) -> str:

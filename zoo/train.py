@@ -494,6 +494,7 @@ def build(
     if args.algo != CO_TRAINING:
         settings["replay_buffer_class"] = algorithm.default_buffer_class
     model = algorithm.load(args.trained_agent, env, **settings)
+    model.require_learner()
     buffer_file = RunFolder.of_model(args.trained_agent, args.env).replay_buffer
     if buffer_file.exists():
         model.load_replay_buffer(buffer_file)

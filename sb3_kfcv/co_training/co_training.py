@@ -41,7 +41,10 @@ BUILT_OF = (
 )
 
 # Of a learner's attributes, those that come from the whole, or of other sections of its file.
-NOT_OF_A_TEAM = ("opponents", "_last_obs", "_last_original_obs", "_last_episode_starts", "ep_info_buffer", "ep_success_buffer")
+NOT_OF_A_TEAM = (
+    *("plays_only", "opponents", "_last_obs", "_last_original_obs", "_last_episode_starts"),
+    *("ep_info_buffer", "ep_success_buffer"),
+)
 
 
 class Policies(nn.ModuleList):
@@ -143,7 +146,8 @@ class CoTraining(JointAlgorithm):
         for team, learner in self.learners.items():
             self._players[team].model = learner
         self.policy = Policies([learner.policy for learner in self.learners.values()])
-        self.replay_buffer = TeamBuffers({team: learner.replay_buffer for team, learner in self.learners.items()})
+        if not self.plays_only:
+            self.replay_buffer = TeamBuffers({team: learner.replay_buffer for team, learner in self.learners.items()})
         self.train_freq = next(iter(self.learners.values())).train_freq
         self.learning_starts = min(learner.learning_starts for learner in self.learners.values())
         meeting: Mapping[str, Any] = self._pools if self.pool_share > 0 else self._players
@@ -152,7 +156,7 @@ class CoTraining(JointAlgorithm):
         self._line_up: LineUp | None = None  # who of pools and mixtures plays in each world
         self._next_selves = 0  # env steps after which the pools take up the teams as they are
         self._wins = wins_of(self.env) if self.env is not None else {}
-        if self.verbose > 0:
+        if self.verbose > 0 and not self.plays_only:
             print(f"Replay buffers: {in_words(self.replay_buffer.n_bytes)} ({in_words(free_memory())} of memory are free)")
 
     def check_settings(self) -> None:
@@ -206,6 +210,7 @@ class CoTraining(JointAlgorithm):
         )
         learner.layout, learner.n_envs, learner.world_facts = self.layout, self.n_envs, self.world_facts
         learner.observation_space, learner.action_space = self.observation_space, self.action_space
+        learner.plays_only = self.plays_only
         learner.stores_state = any(own.get("critic_input", "observations") != "observations" for own in self.teams.values())
         learner._setup_model()
         learner.set_logger(Logger(None, []))  # what it logs is logged here, by its team's name
@@ -376,7 +381,7 @@ class CoTraining(JointAlgorithm):
             for name in BUILT_OF:
                 if attributes.get(name) != getattr(learner, name):
                     raise ValueError(f"{name} of {team} is {attributes.get(name)}; this model has {getattr(learner, name)}")
-            vars(learner).update({name: value for name, value in attributes.items() if name != "n_envs"})
+            vars(learner).update({name: value for name, value in attributes.items() if name not in ("n_envs", "plays_only")})
             learner.check_settings()
 
     def training_state(self) -> dict[str, Any]:
@@ -414,7 +419,7 @@ class CoTraining(JointAlgorithm):
         return [*super()._excluded_save_params(), *made, "lr_schedule", "start_time"]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        parts = ("", ".actor.optimizer", ".critic.optimizer")
+        parts = ("",) if self.plays_only else ("", ".actor.optimizer", ".critic.optimizer")
         return [f"policy.{i}{part}" for i in range(len(self.teams)) for part in parts], []
 
 

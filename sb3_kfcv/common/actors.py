@@ -208,6 +208,21 @@ def hidden_sizes(net_arch: list[int] | dict[str, list[int]] | None) -> tuple[lis
     return get_actor_critic_arch([64, 64] if net_arch is None else net_arch)
 
 
+def actor_settings(policy_kwargs: Mapping[str, Any], share_parameters: bool) -> dict[str, Any]:
+    """
+    What the actors of a model are made of, as arguments of :class:`ActorPolicy`.
+
+    :param policy_kwargs: of the model
+    :param share_parameters: one network per group of agents instead of one per agent
+    """
+    return {
+        "net_arch": list(hidden_sizes(policy_kwargs.get("net_arch"))[0]),
+        "activation_fn": policy_kwargs.get("activation_fn", nn.ReLU),
+        "share_parameters": share_parameters,
+        "layer_norm": policy_kwargs.get("layer_norm", False),
+    }
+
+
 class ActorPolicy(BasePolicy):
     """
     The actors of some agents, ready to play: ``predict`` takes joint rows and gives joint actions, in which the columns of

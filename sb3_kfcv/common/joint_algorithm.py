@@ -103,7 +103,9 @@ class JointAlgorithm(SaveableAlgorithm):
         :param tb_log_name: name of the run in the TensorBoard folder; by default the algorithm's
         :param reset_num_timesteps: start counting anew
         :param progress_bar: show progress and time left
+        :raises ValueError: if the model was released for playing only
         """
+        self.require_learner()
         return super().learn(
             total_timesteps=total_timesteps,
             callback=callback,

@@ -16,6 +16,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
+from sb3_kfcv.common.actors import ActorPolicy, actor_settings
 from sb3_kfcv.common.checks import require_between, require_count, require_finite_columns, require_parameters
 from sb3_kfcv.common.denormals import without_denormals
 from sb3_kfcv.common.joint_algorithm import JointAlgorithm
@@ -185,6 +186,9 @@ class MADDPG(JointAlgorithm):
         self._agent_of_column = th.tensor(agent_of_column, device=self.device)
         self._opponent_policy = self._make_opponent_policy()
         self._line_up: LineUp | None = None  # who of the opponents plays in each world
+        if self.plays_only:
+            self._setup_actors_alone()
+            return
         needs_state = self.critic_input != "observations" or self.stores_state
         state_size = layout.state_size if needs_state else 0
         if self.action_noise is None and not layout.discrete and self.exploration_noise > 0:
@@ -217,6 +221,14 @@ class MADDPG(JointAlgorithm):
                 f"{self.replay_buffer.buffer_size * self.n_envs:,} joint transitions, {in_words(self.replay_buffer.n_bytes)}"
             )
             print(f"Replay buffer: {held} ({in_words(free_memory())} of memory are free)")
+
+    def _setup_actors_alone(self) -> None:
+        """All that a model which was released for playing only is set up with."""
+        self.set_random_seed(self.seed)
+        settings = actor_settings(self.policy_kwargs, self.share_parameters)
+        actors = ActorPolicy(self.observation_space, self.action_space, self.layout, self.agents, **settings)
+        self.policy = actors.to(self.device)  # type: ignore[assignment]
+        self.actor = self.policy.actor.requires_grad_(False)
 
     def _setup_lr_schedule(self) -> None:
         rate: Any = self.learning_rate
@@ -546,4 +558,4 @@ class MADDPG(JointAlgorithm):
         return super()._excluded_save_params() + excluded
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        return ["policy", "actor.optimizer", "critic.optimizer"], []
+        return ["policy"] if self.plays_only else ["policy", "actor.optimizer", "critic.optimizer"], []

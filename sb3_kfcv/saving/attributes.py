@@ -51,6 +51,8 @@ def check_attributes(attributes: dict[str, Any], algorithm: type) -> None:
     _check_opponents(attributes.get("opponents"))
     _check_facts(attributes.get("world_facts", {}))
     _check_noise(attributes.get("action_noise"), attributes["action_space"].shape)
+    if type(attributes.get("plays_only", False)) is not bool:
+        raise ValueError(f"plays_only is yes or no, not {attributes['plays_only']!r}")
     require_count("n_envs", attributes["n_envs"])
     for name in COUNTERS:
         require_count(name, attributes.get(name, 0), least=0)

@@ -56,6 +56,9 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
         *("policy_class", "learning_rate", "action_noise", "policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs"),
     )
 
+    # Whether it was released for playing only, see :func:`sb3_kfcv.saving.releases.release_model`.
+    plays_only: bool = False
+
     layout: AgentLayout
     replay_buffer: JointReplayBuffer
 
@@ -127,6 +130,16 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
         :param sections: those of ``FURTHER_SECTIONS`` that the file has, by name
         :raises ValueError: if they do not fit
         """
+
+    def require_learner(self) -> None:
+        """
+        :raises ValueError: if it was released for playing only
+        """
+        if self.plays_only:
+            raise ValueError(
+                "the model was released for playing only, without critics and optimisers; to train, start a new run, with the "
+                "command in the README.md beside the released file"
+            )
 
     # ---- models
 
@@ -243,6 +256,7 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
 
         :param path: of the zip file (the ending is added), or an open file
         """
+        self.require_learner()
         target = with_suffix(path, ".zip") if isinstance(path, (str, pathlib.Path)) else path
         buffer = self.replay_buffer
         sections = {"replay_buffer": self.replay_buffer_state(), "transitions": packed(buffer.transitions())}
@@ -261,6 +275,7 @@ class SaveableAlgorithm(OffPolicyAlgorithm):
         :param truncate_last_traj: not used
         :raises ValueError: if the file is damaged, or of another buffer
         """
+        self.require_learner()
         source = with_suffix(path, ".zip") if isinstance(path, (str, pathlib.Path)) else path
         with open_archive(source, "replay buffer") as archive, refusals(archive, "replay_buffer"):
             self.set_replay_buffer_state(archive.read("replay_buffer"), unpacked(archive.read("transitions")))

@@ -10,9 +10,8 @@ from typing import Any, Protocol
 
 import numpy as np
 from gymnasium import spaces
-from torch import nn
 
-from sb3_kfcv.common.actors import ActorPolicy, hidden_sizes, make_player, player_in
+from sb3_kfcv.common.actors import ActorPolicy, actor_settings, make_player, player_in
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.envs.scripted import SCRIPTED_POLICIES, ScriptedPolicy, scripted_policy
@@ -276,14 +275,11 @@ def roles_in(path: str | os.PathLike[str]) -> tuple[tuple[str, ...], dict[str, A
 
 def _actors_of(attributes: Mapping[str, Any], parameters: Mapping[str, Any]) -> ActorPolicy:
     """The actors of a model, from its attributes and the parameters of its policy."""
-    layout, team, settings = attributes["layout"], attributes.get("team"), dict(attributes["policy_kwargs"])
+    layout, team = attributes["layout"], attributes.get("team")
     return make_player(
         {name.removeprefix("actor."): tensor for name, tensor in parameters.items() if name.startswith("actor.")},
         agents=list(layout.members(team) if team else range(layout.n_agents)),
-        net_arch=list(hidden_sizes(settings.get("net_arch"))[0]),
-        activation_fn=settings.get("activation_fn", nn.ReLU),
-        share_parameters=attributes.get("share_parameters", False),
-        layer_norm=settings.get("layer_norm", False),
+        **actor_settings(dict(attributes["policy_kwargs"]), attributes.get("share_parameters", False)),
         **{name: attributes[name] for name in ("observation_space", "action_space", "layout")},
     )
 
