@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -23,11 +22,11 @@ import scale
 import speed
 
 from sb3_kfcv.saving.files import atomic_write
+from zoo import pages
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "performance.md"
 RESULTS = ROOT / "docs" / "results"
-PLACE = re.compile(r"(<!-- table: ([a-z-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def measured_on(results: dict[str, Any]) -> str:
@@ -100,7 +99,7 @@ def filled(page: str, results: Path) -> str:
     :param page: Markdown
     :param results: folder of the JSON files
     """
-    return PLACE.sub(lambda place: f"{place[1]}\n{table(place[2], results)}\n\n{place[3]}", page)
+    return pages.filled(page, partial(table, results=results))
 
 
 def main() -> None:

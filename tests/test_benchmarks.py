@@ -83,7 +83,7 @@ def test_tables_are_filled_in_place_and_stay_as_they_are(script, tmp_path):
 
 def test_every_table_of_the_page_has_a_maker(script):
     report = script("report")
-    names = [name for _, name, _ in report.PLACE.findall(report.PAGE.read_text())]
+    names = [name for _, name, _ in report.pages.PLACE.findall(report.PAGE.read_text())]
     assert sorted(names) == sorted(report.TABLES)
 
 

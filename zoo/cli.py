@@ -17,6 +17,7 @@ COMMANDS = {
     "match": "everybody of one team against everybody of another, with ratings",
     "optimize": "search for better hyperparameters",
     "sweep": "many runs from one file, on this machine or on a cluster",
+    "reproduce": "every table and figure of the paper, on top of sweeps",
     "gallery": "a page of videos, curves, tables and commands, made from runs",
     "release": "a small model for playing, with its model card, made of the best of some runs",
     "demo": "three minutes of training, from nothing to a table and a film",

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.special import stdtrit
 from scipy.stats import trim_mean
 
 from sb3_kfcv.common.evaluation import CONFIDENCE, Interval
@@ -21,6 +22,9 @@ N_RESAMPLES = 5_000
 
 # Of fewer runs an interval says little: too few different samples can be drawn from them.
 ENOUGH_RUNS = 5
+
+# A difference that is there should be shown with this probability.
+POWER = 0.8
 
 
 def iqm(values: np.ndarray) -> np.ndarray:
@@ -110,6 +114,40 @@ def _improvement(better: np.ndarray, than: np.ndarray) -> np.ndarray:
     """P(X > Y) of each draw: (..., runs) and (..., runs) → (...)."""
     difference = better[..., :, None] - than[..., None, :]
     return ((difference > 0) + 0.5 * (difference == 0)).mean(axis=(-2, -1))
+
+
+def difference_with_interval(
+    values: np.ndarray, others: np.ndarray, rng: np.random.Generator, n_resamples: int = N_RESAMPLES
+) -> Interval:
+    """
+    The difference of two IQMs and its 95 % bootstrap interval.
+
+    :param values: (runs,)
+    :param others: what is taken from them (runs,)
+    :param rng: of the bootstrap
+    :param n_resamples: its draws
+    :return: the bounds are NaN for a single run of either
+    """
+    draws = iqm(resampled(values, rng, n_resamples)) - iqm(resampled(others, rng, n_resamples))
+    return with_percentiles(float(iqm(values) - iqm(others)), draws, min(len(values), len(others)))
+
+
+def smallest_difference(values: np.ndarray, others: np.ndarray) -> float:
+    """
+    The difference of two means that so many runs, which vary so much, show with probability ``POWER``: by a two-sided t-test
+    of 5 %, its power approximated by a central t distribution.
+
+    :param values: (runs,)
+    :param others: (runs,)
+    :return: NaN for less than two runs of either
+    """
+    n, m = len(values), len(others)
+    if min(n, m) < 2:
+        return float("nan")
+    freedom = n + m - 2
+    variance = ((n - 1) * values.var(ddof=1) + (m - 1) * others.var(ddof=1)) / freedom
+    quantiles = stdtrit(freedom, (1 + CONFIDENCE) / 2) + stdtrit(freedom, POWER)
+    return float(quantiles * np.sqrt(variance * (1 / n + 1 / m)))
 
 
 def profile(scores: Scores, thresholds: np.ndarray) -> np.ndarray:

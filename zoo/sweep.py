@@ -5,6 +5,7 @@ by side on this machine, or on a Ray cluster. The same command again goes on wit
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import signal
@@ -65,12 +66,30 @@ def make_parser() -> Parser:
     add = parser.add_argument
     add("file", help="YAML file of the sweep, as above")
     add("-f", "--log-folder", help="where all runs lie (default: sweeps/<name of the file>)")
+    add_workers(parser)
+    add("--dry-run", action="store_true", help="check everything and list the runs, but begin none")
+    return parser
+
+
+def add_workers(parser: Parser) -> None:
+    """The flags that say who carries out the runs."""
+    add = parser.add_argument
     add("--workers", type=whole_number, help="runs at a time (default: as many as there are cores for)")
     add("--threads", type=whole_number, default=1, help="cores that each run takes (default: %(default)s)")
     add("--address", help="of a Ray cluster, such as 10.0.0.1:6379, or auto for the one that this machine is part of")
     add("--local", action="store_true", help="processes of this machine, without Ray")
-    add("--dry-run", action="store_true", help="check everything and list the runs, but begin none")
-    return parser
+
+
+def check_workers(args: argparse.Namespace) -> None:
+    """
+    :param args: the command line
+    :raises ValueError: for a flag of :func:`add_workers` that cannot be
+    """
+    for name in ("threads", "workers"):
+        if getattr(args, name) is not None:
+            require_count(f"--{name}", getattr(args, name))
+    if args.local and args.address:
+        raise ValueError("--local goes without Ray, and --address names a Ray cluster; give one of them")
 
 
 @contextmanager
@@ -151,12 +170,12 @@ def what_happened(run: PlannedRun, status: int) -> str:
     return f"{run.name} {how} (exit status {status}; {run.place.log}){': ' + errors[-1] if errors else ''}"
 
 
-def carry_out(runs: Sequence[PlannedRun], plan: Path, workers: Workers, table: ProgressTable) -> list[str]:
+def carry_out(runs: Sequence[PlannedRun], tasks: Sequence[Task], workers: Workers, table: ProgressTable) -> list[str]:
     """
-    Have all runs that have not ended carried out.
+    Have runs carried out.
 
     :param runs: of the sweep
-    :param plan: see :func:`task_of`
+    :param tasks: by the names of those runs that have not ended
     :param workers: who does it
     :param table: shows how far they are
     :return: what went wrong, a sentence for each run
@@ -165,9 +184,8 @@ def carry_out(runs: Sequence[PlannedRun], plan: Path, workers: Workers, table: P
     """
     by_name = {run.name: run for run in runs}
     failures = []
-    for run in runs:
-        if table.runs[run.name].state != DONE:
-            workers.submit(task_of(run, plan))
+    for task in tasks:
+        workers.submit(task)
     try:
         while not workers.idle:
             for task, status in workers.ended(0.5):
@@ -185,19 +203,20 @@ def carry_out(runs: Sequence[PlannedRun], plan: Path, workers: Workers, table: P
     return failures
 
 
-def sweep(runs: Sequence[PlannedRun], plan: Path, workers: Workers, again: str) -> int:
+def sweep(runs: Sequence[PlannedRun], tasks: Sequence[Task], workers: Workers, folder: Path, again: str) -> int:
     """
     Carry out a sweep that was found to be right, and say what came of it.
 
     :param runs: of the sweep
-    :param plan: see :func:`task_of`
+    :param tasks: see :func:`carry_out`
     :param workers: who does it
+    :param folder: of all runs
     :param again: the command
     :return: exit status
     """
     with interrupted_by_signals() as signals, ProgressTable(runs) as table:
         try:
-            failures = carry_out(runs, plan, workers, table)
+            failures = carry_out(runs, tasks, workers, table)
         except KeyboardInterrupt:
             failures = []
     if signals:
@@ -205,7 +224,7 @@ def sweep(runs: Sequence[PlannedRun], plan: Path, workers: Workers, again: str) 
         return SIGNALLED + signals[0]
     for failure in failures:
         print(f"error: {failure}", file=sys.stderr)
-    print(f"{table.summary()}; they lie in {plan.parent}")
+    print(f"{table.summary()}; they lie in {folder}")
     if failures:
         print(f"to try again what failed: {again}")
     return 1 if failures else 0
@@ -231,11 +250,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         args = make_parser().parse_all(argv)
-        for name in ("threads", "workers"):
-            if getattr(args, name) is not None:
-                require_count(f"--{name}", getattr(args, name))
-        if args.local and args.address:
-            raise ValueError("--local goes without Ray, and --address names a Ray cluster; give one of them")
+        check_workers(args)
         folder = Path(args.log_folder or Path("sweeps", Path(args.file).stem))
         runs = read_plan(args.file, folder, args.threads)
         check_runs(runs)
@@ -251,9 +266,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             plan, text = folder / "sweep.yml", Path(args.file).read_bytes()
             with atomic_write(plan) as file:
                 file.write(text)
-            local = args.local or len([run for run in begun if run.has_ended]) == len(runs)  # nothing to do needs no Ray
+            tasks = [task_of(run, plan) for run in runs if (found := run.place.run()) is None or not found.has_ended]
+            local = args.local or not tasks  # nothing to do needs no Ray
             with closing(make_workers(args.address, args.workers, args.threads, local)) as workers:
-                return sweep(runs, plan, workers, as_it_was_typed("sweep", argv))
+                return sweep(runs, tasks, workers, folder, as_it_was_typed("sweep", argv))
     except REFUSALS as error:
         return refused(error)
 

@@ -122,11 +122,12 @@ def note(path: Path, **values: Any) -> None:
         path.write_text(json.dumps({**values, "host": platform.node(), "pid": os.getpid()}))
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, extra_callbacks: Sequence[BaseCallback] = ()) -> int:
     """
     Begin the run, or go on with it.
 
     :param argv: flags of ``zoo/train.py``, for a log folder that holds no other run of this algorithm and world
+    :param extra_callbacks: see :func:`zoo.train.main`
     :return: its exit status; 0, too, if the run has ended
     """
     words = list(sys.argv[1:] if argv is None else argv)
@@ -137,13 +138,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         place.lock.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(place.lock, timeout=PATIENCE):
             note(place.progress)
+            callbacks = [Progress(place.progress), *extra_callbacks]
             run = place.run()
             if run is None:
-                return train.main(words, [Progress(place.progress)])
+                return train.main(words, callbacks)
             if run.has_ended:
                 return 0
             going_on = ["--resume", str(run.folder.path), "--verbose", str(args.verbose)]
-            return train.main(going_on, [Progress(place.progress)])
+            return train.main(going_on, callbacks)
     except Timeout:
         return refused(ValueError(f"another process is training in {place.log_folder / place.algo}"))
     except REFUSALS as error:

@@ -1,0 +1,447 @@
+"""
+The reproduction: what the command trains and refuses, that nothing is measured twice and a killed run leaves the same record,
+and that tables, verdicts and pictures say what the records hold.
+"""
+
+import json
+
+import numpy as np
+import pytest
+import yaml
+from test_zoo import ROOT
+
+from sb3_kfcv.common.evaluation import Interval
+from zoo import pages, reproduce, reproduce_report, reproduce_run, train
+from zoo.reproduce_plan import EXPERIMENTS, Claim, Experiment, is_there, planned, read_experiments, read_record
+from zoo.reproduce_report import CANNOT_BE_TOLD, HOLDS, HOLDS_NOT, Results, judged, word_for
+from zoo.statistics import difference_with_interval, smallest_difference
+
+SMALL = {"n_envs": 2, "learning_starts": 20, "batch_size": 8, "buffer_size": 200}
+TINY = {
+    "experiments": {
+        "spread": {
+            "title": "Tiny",
+            "targets": ["table2"],
+            "sweeps": [
+                {
+                    "algos": ["maddpg", "kfcv_maddpg"],
+                    "envs": ["HardSpread-v0"],
+                    "settings": {"": SMALL},
+                    "train": {
+                        "n-timesteps": 400,
+                        "save-freq": 40,
+                        "env-kwargs": {"n_agents": 2, "walls": "none", "max_steps": 5},
+                    },
+                }
+            ],
+            "scripted": [{"agent": "random"}],
+            "columns": {"collisions": "test/own/collisions", "return": {"weights": {"test/own/return_agent": 6}, "plus": -75}},
+            "better": {"collisions": "lower"},
+            "source": "paper",
+            "published": {"kfcv_maddpg": {"collisions": 0.687}},
+            "pictures": {
+                "fig6": [
+                    {"title": "cover rate", "curve": "curve/eval/cover_rate"},
+                    {"title": "returns", "scatter": "test/own/return_agent"},
+                    {"title": "collisions", "estimates": "test/own/collisions"},
+                ]
+            },
+        }
+    },
+    "claims": [
+        {
+            "says": "fewer collisions",
+            "experiment": "spread",
+            "quantity": "test/own/collisions",
+            "lower": "kfcv_maddpg",
+            "than": "maddpg",
+        }
+    ],
+}
+
+
+def changed(**changes):
+    """The tiny experiment with other keys, and no claim."""
+    return {"experiments": {"spread": {**TINY["experiments"]["spread"], **changes}}}
+
+
+def write(folder, given=TINY):
+    file = folder / "experiments.yml"
+    file.write_text(yaml.safe_dump(given))
+    return file
+
+
+def command(folder, *words, target="table2"):
+    places = ["-conf", str(folder / "experiments.yml"), "-f", str(folder / "runs"), "-o", str(folder / "docs")]
+    targets = [target] if target else []
+    return [*targets, *places, "--scale", "0.5", "--seeds", "1", "--test-episodes", "40", "--local", *words]
+
+
+def wanted(folder):
+    (experiment,) = read_experiments(folder / "experiments.yml")[0].values()
+    return planned(experiment, 0.5, folder / "runs", reproduce.records_folder(folder / "docs"), 1, 40)
+
+
+def without_clocks(record):
+    """What must be the same whenever and however often it is measured."""
+    curve = {name: {key: own for key, own in values.items() if key != "seconds"} for name, values in record["curve"].items()}
+    return {**{name: record[name] for name in ("identity", "test")}, "curve": curve}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Two runs, one in this process and one by the command, their records, and the page."""
+    folder = tmp_path_factory.mktemp("made")
+    write(folder)
+    first, second = wanted(folder)
+    assert reproduce_run.main([str(first.begin(keep_runs=False))]) == 0
+    assert first.path.exists() and not second.path.exists()
+    assert reproduce.main(command(folder)) == 0
+    return folder
+
+
+# ---- the whole
+
+
+def test_every_run_leaves_a_record_and_the_page_says_what_they_hold(made):
+    _, second = wanted(made)
+    record = read_record(second.path)
+    assert record["identity"] == second.identity
+    assert record["identity"]["settings"]["n_timesteps"] == 200  # half of 400
+    assert record["test"]["after"] == 190  # 95 %
+    curve = record["curve"]["eval"]
+    assert len(curve["steps"]) == len(curve["cover_rate"]) == 40
+    assert (curve["steps"][-1], curve["episodes"][-1]) == (200, 40)
+    own = record["test"]["tests"]["own"]
+    returns = own["returns"]["return_agent"]
+    assert len(returns) == 40
+    assert own["mean"]["return_agent"] == pytest.approx(np.mean(returns), rel=1e-3)
+    assert own["standard_error"]["return_agent"] == pytest.approx(np.std(returns, ddof=1) / np.sqrt(40), rel=1e-3)
+    assert own["quantiles"]["return_agent"][2] == pytest.approx(np.median(returns), rel=1e-3)
+    assert record["taken"]["wall"] > 0 and record["taken"]["memory"] > 1e7
+    assert record["command"].startswith("python zoo/train.py --algo kfcv_maddpg")
+
+    page = (made / "docs" / "reproduction.md").read_text()
+    (ours,) = [line.split(" | ") for line in page.splitlines() if line.startswith("| KFCV-MADDPG |")]
+    assert float(ours[1]) == pytest.approx(own["mean"]["collisions"], abs=5e-3)
+    assert float(ours[2]) == pytest.approx(6 * own["mean"]["return_agent"] - 75, abs=5e-3)
+    assert "| · paper | 0.687 |" in page and "| `random` |" in page
+    assert "| fewer collisions |" in page and CANNOT_BE_TOLD in page
+    assert "](images/reproduce_fig6.png)" in page
+    assert (made / "docs" / "images" / "reproduce_fig6.png").stat().st_size > 10_000
+
+
+def test_what_is_large_goes_when_the_record_is_there(made):
+    for own in wanted(made):
+        folder = own.run.place.run().folder
+        assert folder.last_model.is_file() and folder.config_file.is_file()
+        assert not [*folder.path.glob("rl_model_*")] and not folder.monitor_file.exists()
+
+
+def test_a_run_that_has_its_record_is_never_run_again(made, capsys, monkeypatch):
+    monkeypatch.setattr(reproduce, "make_workers", None)  # cannot be called
+    before = {own.path: own.path.read_bytes() for own in wanted(made)}
+    assert reproduce.main(command(made)) == 0
+    assert {path: path.read_bytes() for path in before} == before
+    capsys.readouterr()
+    assert reproduce.main(command(made, "--dry-run")) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[0] == "done   spread maddpg seed 0, 200 env steps"
+    assert out.splitlines()[-1] == "2 runs: 0 to begin, 0 to go on with, 2 done"
+    assert reproduce.main(command(made, "--dry-run", "--seeds", "2")) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert out[2].startswith("begin  spread maddpg seed 1, 200 env steps, about 0:00:")
+    assert out[-2] == "4 runs: 2 to begin, 0 to go on with, 2 done" and out[-1].startswith("about 0:00:")
+
+
+def test_the_page_is_made_of_the_records_alone(made, tmp_path, capsys):
+    page = made / "docs" / "reproduction.md"
+    before = page.read_text()
+    page.write_text(f"words by hand\n\n{before}")
+    elsewhere = command(made, "--report", "-f", str(tmp_path / "no_runs"), target=None)
+    assert reproduce.main(elsewhere) == 0
+    assert page.read_text() == f"words by hand\n\n{before}"
+    assert not (tmp_path / "no_runs").exists()
+
+
+def test_a_killed_run_goes_on_to_the_same_record(made, tmp_path, monkeypatch, capsys):
+    """Killed once before and once after the test."""
+    write(tmp_path)
+    _, own = wanted(tmp_path)
+    order = str(own.begin(keep_runs=False))
+    original, moments = train.main, [130, 196]
+
+    class Kill(train.BaseCallback):
+        def _on_step(self):
+            if moments and self.num_timesteps >= moments[0]:
+                moments.pop(0)
+                raise RuntimeError
+            return True
+
+        def get_state(self):
+            return {}
+
+        def set_state(self, saved):
+            pass
+
+    monkeypatch.setattr(train, "main", lambda words, callbacks: original(words, [*callbacks, Kill()]))
+    for _ in range(2):
+        with pytest.raises(RuntimeError):
+            reproduce_run.main([order])
+        assert not own.path.exists()
+    assert reproduce_run.main([order]) == 0
+    assert without_clocks(read_record(own.path)) == without_clocks(read_record(wanted(made)[1].path))
+    assert reproduce_run.main([order]) == 0  # nothing is left to do
+
+
+def test_the_test_is_not_played_again_from_a_checkpoint_behind_it(tmp_path):
+    measure = reproduce_run.Measure(None, {"own": {}}, 2, tmp_path / "measured.json")
+    measure.set_state({"test": {"after": 190}, "taken": {"wall": 5.0, "processor": 4.0, "memory": 7e12}})
+    measure.num_timesteps = 200
+    assert measure._on_step()  # without a model it could not play
+    assert measure.test == {"after": 190}
+    taken = measure.taken()
+    assert 5.0 <= taken["wall"] < 6.0 and 4.0 <= taken["processor"] < 5.0 and taken["memory"] == 7e12
+
+
+def test_tests_are_on_episodes_that_no_training_and_no_evaluation_sees():
+    seeds, worlds = 1000, 1000
+    assert reproduce_run.TEST_SEED > train.EVAL_SEED_OFFSET + seeds + worlds
+
+
+# ---- what is refused
+
+
+def test_a_record_of_other_settings_is_refused(made, capsys):
+    other = changed()
+    other["experiments"]["spread"]["sweeps"] = [
+        {**TINY["experiments"]["spread"]["sweeps"][0], "settings": {"": {**SMALL, "gamma": 0.5}}}
+    ]
+    file = made / "other.yml"
+    file.write_text(yaml.safe_dump(other))
+    assert reproduce.main(command(made, "-conf", str(file))) == 2
+    path = wanted(made)[0].path
+    assert capsys.readouterr().err == (
+        f"error: the record {path} was measured with settings.gamma 0.99, and is now to have 0.5; choose another scale, or "
+        "other settings by another name, or remove the record to measure anew\n"
+    )
+    assert reproduce.main(command(made, "--test-episodes", "30")) == 2
+    assert "was measured with test_episodes 40, and is now to have 30" in capsys.readouterr().err
+    assert reproduce.main(command(made, "--scale", "0.25", "--dry-run")) == 0  # lies apart
+
+
+def test_a_damaged_record_is_told(made, tmp_path):
+    path = tmp_path / "seed_0.json"
+    for text, sentence in (("{", "cannot be read: "), ("[]", "is no record of zoo/reproduce.py")):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=sentence):
+            is_there(path, {})
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["tabel2"], 'unknown target "tabel2"; did you mean "table2"?'),
+        ([], "say what to reproduce: all, spread, table2"),
+        (["table2", "--scale", "0"], "--scale is 0.0; it must be above 0 and at most 1"),
+        (["table2", "--seeds", "0"], "--seeds must be a whole number of at least 1, got 0"),
+        (["table2", "--test-episodes", "1"], "--test-episodes must be a whole number of at least 2, got 1"),
+        (["table2", "--cells", "madpg"], "there is no cell madpg among these; there are kfcv_maddpg, maddpg"),
+        (["table2", "--report"], "--report writes the whole page, of all records; leave out table2"),
+        (["table2", "--local", "--address", "auto"], "--local goes without Ray, and --address names a Ray cluster"),
+    ],
+)
+def test_bad_words(tmp_path, capsys, words, sentence):
+    file = write(tmp_path)
+    assert reproduce.main([*words, "-conf", str(file), "-f", str(tmp_path / "runs"), "-o", str(tmp_path / "docs")]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {sentence}")
+    assert [*tmp_path.iterdir()] == [file]
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"titel": "x"}, 'unknown key of the experiment spread "titel"; did you mean "title"?'),
+        ({"title": ""}, "the experiment spread lacks title"),
+        ({"seeds": 0}, "spread: seeds must be a whole number of at least 1, got 0"),
+        (
+            {"columns": {"x": "own/collisions"}},
+            "spread: a quantity is test/<test>/<metric> or curve/<evaluation>/<metric>, not own/c",
+        ),
+        ({"columns": {"x": "test/graze/collisions"}}, 'unknown test of spread "graze"; known: own'),
+        ({"columns": {"x": "test/own/colisions"}}, 'spread: unknown metric "colisions"; did you mean "collisions"?'),
+        ({"published": {"madpg": {}}}, 'unknown cell of spread "madpg"; did you mean "maddpg"?'),
+        (
+            {"pictures": {"a": [{"title": "a"}]}},
+            "spread: a panel needs a title and one of curve, scatter, estimates, rivals, not",
+        ),
+        ({"effects": {"default": "maddpg"}}, "spread: effects needs default and quantity, not"),
+        (
+            {"sweeps": [{"algos": ["maddpg"], "envs": ["HardSpread-v0"], "seeds": 3}], "published": {}},
+            "spread: seeds of a sweep are not for the file",
+        ),
+        (
+            {"sweeps": [{"algos": ["maddpg"], "envs": ["HardSpred-v0"]}], "published": {}},
+            'unknown environment "HardSpred-v0"; did you mean "HardSpread-v0"?',
+        ),
+        ({"sweeps": 2 * TINY["experiments"]["spread"]["sweeps"]}, "spread: two sweeps have the cell maddpg; give one of them"),
+    ],
+)
+def test_bad_experiments(tmp_path, capsys, changes, sentence):
+    file = write(tmp_path, changed(**changes))
+    assert reproduce.main(command(tmp_path, "--dry-run")) == 2
+    assert sentence in capsys.readouterr().err
+    assert [*tmp_path.iterdir()] == [file]
+
+
+def test_bad_claims(tmp_path):
+    good = TINY["claims"][0]
+    for changes, sentence in (
+        ({"higher": "maddpg"}, "a claim needs says, experiment, quantity, than, and one of higher and lower, not"),
+        ({"experiment": "spred"}, 'unknown experiment "spred"; did you mean "spread"?'),
+        ({"lower": "kfcv"}, 'unknown cell of spread "kfcv"; did you mean "kfcv_maddpg"?'),
+    ):
+        with pytest.raises(ValueError, match=sentence.replace("?", r"\?")):
+            read_experiments(write(tmp_path, {**TINY, "claims": [{**good, **changes}]}))
+
+
+# ---- the paper's experiments
+
+
+def test_the_papers_experiments_are_what_the_paper_says(tmp_path):
+    experiments, claims = read_experiments()
+    all_of_them = {name: planned(own, 1.0, tmp_path, tmp_path) for name, own in experiments.items()}
+    table_1 = all_of_them["hard_spread"]
+    assert {own.cell for own in table_1} == {"maddpg", "per_maddpg", "kfcv_maddpg"}
+    for own in table_1:
+        settings, env = own.run.hyperparams, own.run.hyperparams.env_kwargs
+        assert settings.n_timesteps == 200_000 * env["max_steps"] and env["n_agents"] == 4
+        assert (settings.model["buffer_size"], settings.model["gamma"], own.n_test_episodes) == (5000, 0.99, 10_000)
+    teams = {own.cell: own.run.hyperparams.model["teams"] for own in all_of_them["grassland"]}
+    assert {cell: [theirs["algo"] for theirs in own.values()] for cell, own in teams.items()} == {
+        "kfcv_maddpg_against_maddpg": ["kfcv_maddpg", "maddpg"],
+        "per_maddpg_against_maddpg": ["per_maddpg", "maddpg"],
+        "maddpg_against_maddpg": ["maddpg", "maddpg"],
+        "kfcv_maddpg_against_per_maddpg": ["kfcv_maddpg", "per_maddpg"],
+    }
+    assert {own.run.hyperparams.n_timesteps for own in all_of_them["grassland"]} == {100_000 * 25}
+    assert {own.run.hyperparams.n_timesteps for own in planned(experiments["grassland"], 0.1, tmp_path, tmp_path)} == {250_000}
+    names = [own.run.name for runs in all_of_them.values() for own in runs]
+    assert len(set(names)) == len(names)
+    pytest.importorskip("mpe2")
+    for name, own in experiments.items():
+        reproduce.check_metrics(own, [claim.quantity for claim in claims if claim.experiment == name])
+
+
+def test_the_page_has_a_place_for_everything():
+    experiments, _ = read_experiments()
+    names = [name for _, name, _ in pages.PLACE.findall((ROOT / "docs" / "reproduction.md").read_text())]
+    assert sorted(names) == sorted([*experiments, "claims", "runs"])
+    assert EXPERIMENTS == ROOT / "hyperparams" / "reproduce.yml"
+
+
+# ---- what records say
+
+
+def record(cell, seed, mean=0.0, curve=(0.0,), algo="maddpg"):
+    """A record by hand: `x` of its test, and of the evaluations after 10, 20, … env steps."""
+    steps = [10 * (i + 1) for i in range(len(curve))]
+    settings = {"n_timesteps": 10 * len(curve)}
+    return {
+        "identity": {
+            "experiment": "e",
+            "cell": cell,
+            "scale": 1.0,
+            "seed": seed,
+            "algo": algo,
+            "env": "W",
+            "settings": settings,
+        },
+        "test": {"tests": {"own": {"mean": {"x": mean}}}},
+        "curve": {"eval": {"steps": steps, "episodes": steps, "x": list(curve)}},
+    }
+
+
+def results(**means):
+    cells = {cell: [record(cell, seed, mean) for seed, mean in enumerate(own)] for cell, own in means.items()}
+    effects = {"default": "default", "quantity": "test/own/x"}
+    experiment = Experiment("e", "E", [{"algos": [*means], "envs": ["W"]}], effects=effects)
+    return Results(experiment, 1.0, cells, {})
+
+
+def test_the_rule_of_verdicts():
+    for interval, n_seeds, word in (
+        (Interval(0.9, 0.51, 1.0), 5, HOLDS),
+        (Interval(0.9, 0.51, 1.0), 4, CANNOT_BE_TOLD),
+        (Interval(0.9, 0.5, 1.0), 5, CANNOT_BE_TOLD),
+        (Interval(0.1, 0.0, 0.49), 5, HOLDS_NOT),
+        (Interval(0.4, 0.1, 0.6), 10, CANNOT_BE_TOLD),
+    ):
+        assert word_for(interval, 0.5, n_seeds) == word
+
+
+def test_claims_about_two_cells():
+    told = results(a=[1, 2, 3, 4, 5], b=[6, 7, 8, 9, 10])
+    claim = {"says": "", "experiment": "e", "quantity": "test/own/x"}
+    assert judged(Claim(**claim, lower=True, cell="a", than="b"), told).word == HOLDS
+    assert judged(Claim(**claim, lower=False, cell="a", than="b"), told).word == HOLDS_NOT
+    assert judged(Claim(**claim, lower=False, cell="b", than="a"), told).numbers.endswith("P 1.00 [1.00, 1.00]")
+    mixed = judged(Claim(**claim, lower=False, cell="a", than="b"), results(a=[1, 9, 3, 7, 5], b=[6, 2, 8, 4, 5]))
+    assert (mixed.word, mixed.n_seeds) == (CANNOT_BE_TOLD, 5)
+    missing = judged(Claim(**claim, lower=False, cell="a", than="b"), results(a=[1, 2, 3, 4, 5]))
+    assert (missing.word, missing.n_seeds, missing.numbers) == (CANNOT_BE_TOLD, 0, "")
+
+
+def test_claims_about_a_number_take_the_mean_of_the_late_curve():
+    curve = [0.0, 0.2, 0.8, 1.0]  # from half of the training on: after 20, 30 and 40 of 40 env steps, 2/3
+    told = Results(Experiment("e", "E", []), 1.0, {"a": [record("a", seed, curve=curve) for seed in range(5)]}, {})
+    claim = {"says": "", "experiment": "e", "quantity": "curve/eval/x", "cell": "a", "since": 0.5}
+    assert told.values("a", "curve/eval/x", 0.5) == pytest.approx(2 / 3)
+    assert judged(Claim(**claim, lower=False, than=0.6), told).word == HOLDS
+    assert judged(Claim(**claim, lower=False, than=0.7), told).word == HOLDS_NOT
+    assert judged(Claim(**claim, lower=True, than=0.7), told).word == HOLDS
+
+
+def test_effects_stand_beside_the_default_the_largest_first():
+    told = results(default=[1.0, 1.1, 0.9, 1.0, 1.0], small=[1.2, 1.1, 1.3, 1.2, 1.2], large=[0.1, 0.2, 0.0, 0.1, 0.1])
+    lines = [line.split(" | ") for line in reproduce_report.effects_table(told).splitlines()[2:]]
+    assert [(line[0], line[4]) for line in lines] == [("| MADDPG", ""), ("| MADDPG", "worse"), ("| MADDPG", "better")]
+    # the middle three of each: 1.0, 1.2 and 0.1
+    assert [float(line[2].split(" [")[0]) for line in lines[1:]] == pytest.approx([-0.9, 0.2])
+
+
+def test_the_smallest_difference_by_hand():
+    """Two groups of five whose standard deviation is 1: (t 0.975 + t 0.8 of 8 degrees of freedom) · √(2/5)."""
+    values = np.array([-1.0, 1.0, -1.0, 1.0, 0.0])
+    assert values.std(ddof=1) == 1.0
+    assert smallest_difference(values, values + 7) == pytest.approx((2.306004 + 0.888890) * np.sqrt(0.4), rel=1e-5)
+    assert np.isnan(smallest_difference(values, values[:1]))
+
+
+def test_the_smallest_difference_is_shown_that_often():
+    """By simulation, beside the t-test of scipy."""
+    from scipy.stats import ttest_ind
+
+    rng = np.random.default_rng(0)
+    a, b = rng.standard_normal((2, 4000, 5))
+    least = smallest_difference(np.array([-1.0, 1.0, -1.0, 1.0, 0.0]), np.array([-1.0, 1.0, -1.0, 1.0, 0.0]))
+    assert np.mean(ttest_ind(a + least, b, axis=1).pvalue < 0.05) == pytest.approx(0.8, abs=0.02)
+
+
+def test_a_difference_has_an_interval_of_both_sides_draws():
+    rng = np.random.default_rng(0)
+    one = difference_with_interval(np.array([2.0, 2.0, 2.0]), np.array([1.0, 1.0, 1.0]), rng)
+    assert tuple(one) == (1.0, 1.0, 1.0)
+    wide = difference_with_interval(np.arange(5.0), np.arange(5.0) + 1, rng)
+    assert wide.mean == -1.0 and wide.low < -2 and wide.high > 0
+
+
+def test_records_of_different_scales_never_mix(tmp_path):
+    experiment = Experiment("e", "E", [{"algos": ["maddpg"], "envs": ["W"]}])
+    for scale, means in ((0.1, [1.0, 2.0, 3.0]), (0.5, [7.0])):
+        for seed, mean in enumerate(means):
+            path = experiment.records(tmp_path, scale) / "maddpg" / f"seed_{seed}.json"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(record("maddpg", seed, mean)))
+    told = reproduce_report.read_results(experiment, tmp_path)
+    assert told.scale == 0.5 and told.values("maddpg", "test/own/x").tolist() == [7.0]

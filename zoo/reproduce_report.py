@@ -1,0 +1,470 @@
+"""What the records of a reproduction say: tables, pictures, and a verdict on each claim of the paper."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import ScalarFormatter
+
+from sb3_kfcv.common.evaluation import Interval
+from sb3_kfcv.common.memory import in_words
+from zoo.compare_results import BOOTSTRAP_SEED, clock_time, decimals
+from zoo.hyperparams import CO_TRAINING
+from zoo.match_results import as_markdown, described, shown, write_text
+from zoo.pages import filled
+from zoo.plots import draw_estimates, draw_intervals, draw_legend, draw_references, line_styles, new_figure, save_figure
+from zoo.reproduce_plan import Claim, Experiment, read_record
+from zoo.run_groups import algo_label
+from zoo.statistics import (
+    ENOUGH_RUNS,
+    difference_with_interval,
+    improvement_with_interval,
+    iqm_curve,
+    iqm_with_interval,
+    smallest_difference,
+)
+
+PAGE = "reproduction.md"
+HOLDS, HOLDS_NOT, CANNOT_BE_TOLD = "holds", "does not hold", "cannot be told"
+
+SIDES = ("#D55E00", "#0072B2")  # of two teams, as everywhere
+
+Record = dict[str, Any]
+Quantity = str | Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Results:
+    """
+    The records of an experiment, all of one scale.
+
+    :param experiment: the experiment
+    :param scale: share of its env steps; the largest of which there are records
+    :param cells: cell → the records of its seeds, in the order of the experiment
+    :param scripted: who plays every group → record
+    """
+
+    experiment: Experiment
+    scale: float
+    cells: Mapping[str, Sequence[Record]]
+    scripted: Mapping[str, Record]
+
+    @property
+    def algos(self) -> dict[str, str]:
+        """Cell → the algorithm that gives it its colour: of the first team, where teams learn by several."""
+        return {cell: _algo_of(records[0]) for cell, records in self.cells.items()}
+
+    def values(self, cell: str, of: Quantity, since: float = 0.0) -> np.ndarray:
+        """A quantity of each run of a cell (runs,)."""
+        return np.array([quantity(record, of, since) for record in self.cells.get(cell, ())])
+
+
+def read_results(experiment: Experiment, folder: Path) -> Results:
+    """
+    What there is of an experiment.
+
+    :param experiment: the experiment
+    :param folder: of all records
+    :raises ValueError: for a damaged record
+    """
+    scales = {float(path.name.removeprefix("scale_")): path for path in (folder / experiment.name).glob("scale_*")}
+    found = {scale: sorted(path.rglob("seed_*.json")) for scale, path in scales.items()}
+    scale = max((scale for scale, paths in found.items() if paths), default=0.0)
+    records = sorted(map(read_record, found.get(scale, ())), key=lambda record: record["identity"]["seed"])
+    cells: dict[str, list[Record]] = {}
+    for record in records:
+        cells.setdefault(record["identity"]["cell"], []).append(record)
+    ordered = {cell: cells[cell] for cell in [*experiment.cells, *sorted(cells)] if cell in cells}
+    paths = {" against ".join(own.values()): experiment.scripted_record(folder, own) for own in experiment.scripted}
+    scripted = {label: read_record(path) for label, path in paths.items() if path.is_file()}
+    return Results(experiment, scale, ordered, scripted)
+
+
+def quantity(record: Record, of: Quantity, since: float = 0.0) -> float:
+    """
+    A number of a run.
+
+    :param record: of the run
+    :param of: ``test/<test>/<metric>``, ``curve/<evaluation>/<metric>``, or weights of these and what is added
+    :param since: mean of a curve from this share of the training on
+    :raises ValueError: if the record has no such number
+    """
+    if not isinstance(of, str):
+        return sum(weight * quantity(record, name, since) for name, weight in of["weights"].items()) + of.get("plus", 0.0)
+    kind, name, metric = of.split("/", 2)
+    try:
+        if kind == "test":
+            return record["test"]["tests"][name]["mean"][metric]
+        curve = record["curve"][name]
+        late = np.array(curve["steps"]) >= since * record["identity"]["settings"]["n_timesteps"]
+        return float(np.mean(np.array(curve[metric])[late]))
+    except KeyError:
+        raise ValueError(f"the records of {record['identity']['experiment']} have no {of}") from None
+
+
+def label_of(record: Record) -> str:
+    """What a cell is called, for people."""
+    identity = record["identity"]
+    teams = identity["settings"].get("teams")
+    if teams:
+        return " against ".join(f"{algo_label(theirs['algo'])} {team}" for team, theirs in teams.items())
+    setting = identity["cell"].rpartition("/")[0]
+    return ", ".join(filter(None, (algo_label(identity["algo"]), setting.replace("_", " "))))
+
+
+def _algo_of(record: Record) -> str:
+    identity = record["identity"]
+    if identity["algo"] != CO_TRAINING:
+        return identity["algo"]
+    return next(iter(identity["settings"]["teams"].values()))["algo"]
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(BOOTSTRAP_SEED)
+
+
+def iqm_of(values: np.ndarray) -> Interval:
+    """The IQM over runs with its interval."""
+    return iqm_with_interval({"": values}, _rng())
+
+
+# ---- verdicts
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """
+    What runs say of a claim.
+
+    :param claim: what is claimed
+    :param numbers: what was found, in words
+    :param n_seeds: of whoever has fewest
+    :param word: holds, does not hold, cannot be told
+    """
+
+    claim: Claim
+    numbers: str
+    n_seeds: int
+    word: str
+
+
+def judged(claim: Claim, results: Results) -> Verdict:
+    """
+    Hold a claim against the records. Of two cells: the interval of P(improvement) is above one half, or below, or has it
+    within; of a cell and a number: the interval of the IQM likewise. Of fewer than ``ENOUGH_RUNS`` seeds nothing can be told.
+
+    :param claim: what is claimed
+    :param results: of its experiment
+    """
+    values = results.values(claim.cell, claim.quantity, claim.since)
+    sign = -1 if claim.lower else 1
+    if isinstance(claim.than, str):
+        others = results.values(claim.than, claim.quantity, claim.since)
+        n_seeds, border = min(len(values), len(others)), 0.5
+        if not n_seeds:
+            return Verdict(claim, "", 0, CANNOT_BE_TOLD)
+        interval = improvement_with_interval({"": sign * values}, {"": sign * others}, _rng())
+        places = decimals(np.concatenate([values, others]))
+        sides = f"{shown(iqm_of(values), places)} against {shown(iqm_of(others), places)}"
+        numbers = f"{sides}; P {shown(interval)}"
+    else:
+        n_seeds, border = len(values), claim.than
+        if not n_seeds:
+            return Verdict(claim, "", 0, CANNOT_BE_TOLD)
+        interval = iqm_of(values)
+        numbers = shown(interval)
+        if claim.lower:
+            interval, border = Interval(-interval.mean, -interval.high, -interval.low), -border
+    return Verdict(claim, numbers, n_seeds, word_for(interval, border, n_seeds))
+
+
+def word_for(interval: Interval, border: float, n_seeds: int) -> str:
+    """
+    The rule of all verdicts.
+
+    :param interval: of what should be high
+    :param border: that it should be above
+    :param n_seeds: from which it was found
+    """
+    if n_seeds < ENOUGH_RUNS:
+        return CANNOT_BE_TOLD
+    if interval.low > border:
+        return HOLDS
+    return HOLDS_NOT if interval.high < border else CANNOT_BE_TOLD
+
+
+# ---- tables: lines of texts, the head first
+
+
+def results_table(results: Results) -> str:
+    """The columns of an experiment: each cell, what was published of it, and the scripted policies."""
+    columns = results.experiment.columns
+    found = {cell: {name: results.values(cell, of) for name, of in columns.items()} for cell in results.cells}
+    every = {name: np.concatenate([own[name] for own in found.values()]) for name in columns}
+    places = {name: max(2, decimals(values)) for name, values in every.items()}
+    lower = {name for name, side in results.experiment.better.items() if side == "lower"}
+    lines = [["", *(f"{name} {'↓' if name in lower else '↑'}" for name in columns), "seeds"]]
+    for cell, records in results.cells.items():
+        numbers = [shown(iqm_of(values), places[name]) for name, values in found[cell].items()]
+        lines.append([label_of(records[0]), *numbers, str(len(records))])
+        published = results.experiment.published.get(cell)
+        if published:
+            lines.append([f"· {results.experiment.source}", *(_published(published.get(name)) for name in columns), ""])
+    for label, record in results.scripted.items():
+        lines.append([f"`{label}`", *(_scripted(record, of, places[name]) for name, of in columns.items()), ""])
+    return as_markdown(lines)
+
+
+def _published(value: Any) -> str:
+    if value is None:
+        return ""
+    return " ± ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _scripted(record: Record, of: Quantity, places: int) -> str:
+    try:
+        return f"{quantity(record, of):.{places}f}"
+    except (KeyError, ValueError):
+        return ""
+
+
+def effects_table(results: Results) -> str:
+    """Every cell beside the default one, the largest effect first."""
+    default, of = results.experiment.effects["default"], results.experiment.effects["quantity"]
+    base = results.values(default, of)
+    if not len(base):
+        return f"*The default, {default}, has not been measured yet.*"
+    head = ["", described(of.rpartition("/")[2]), "difference to the default", "smallest that could be shown", "so", "seeds"]
+    rows = []
+    for cell, records in results.cells.items():
+        values = results.values(cell, of)
+        places = max(2, decimals(np.concatenate([values, base])))
+        line = [label_of(records[0]), shown(iqm_of(values), places)]
+        difference = difference_with_interval(values, base, _rng())
+        if cell == default:
+            rows.append((np.inf, [*line, "", "", "", str(len(values))]))
+            continue
+        n_seeds = min(len(values), len(base))
+        so = {HOLDS: "better", HOLDS_NOT: "worse"}.get(word_for(difference, 0.0, n_seeds), CANNOT_BE_TOLD)
+        least = smallest_difference(values, base)
+        line += [shown(difference, places), "" if np.isnan(least) else f"{least:.{places}f}", so, str(len(values))]
+        rows.append((abs(difference.mean), line))
+    return as_markdown([head, *(line for _, line in sorted(rows, key=lambda row: -row[0]))])
+
+
+def claims_table(claims: Sequence[Claim], results: Mapping[str, Results]) -> str:
+    """A verdict on each claim."""
+    lines = [["the paper", "here", "seeds", "so"]]
+    for claim in claims:
+        own = judged(claim, results[claim.experiment])
+        lines.append([claim.says, own.numbers or "not measured yet", str(own.n_seeds), own.word])
+    return as_markdown(lines)
+
+
+def runs_table(results: Mapping[str, Results]) -> str:
+    """What the runs took, on what."""
+    lines = [["experiment", "cell", "seeds", "scale", "env steps", "episodes", "time", "processor", "memory"]]
+    machines: Counter[str] = Counter()
+    for own in results.values():
+        for cell, records in own.cells.items():
+            taken = {name: float(np.median([record["taken"][name] for record in records])) for name in records[0]["taken"]}
+            identity, curve = records[0]["identity"], records[0]["curve"].get("eval")
+            lines.append(
+                [
+                    *(own.experiment.name, cell, str(len(records)), f"{own.scale:g}"),
+                    f"{identity['settings']['n_timesteps']:,}",
+                    f"{curve['episodes'][-1]:,}" if curve else "",
+                    *(clock_time(taken["wall"]), clock_time(taken["processor"]), in_words(taken["memory"])),
+                ]
+            )
+            for record in records:
+                versions = ", ".join(f"{name} {number}" for name, number in record["versions"].items())
+                machines[f"{record['machine']['processor']}, {record['machine']['cores']} cores; {versions}"] += 1
+    if len(lines) == 1:
+        return "*No run has its record yet.*"
+    told = "\n".join(f"- {count} runs on {machine}" for machine, count in machines.items())
+    return f"{as_markdown(lines)}\n\nMedians over seeds.\n\n{told}"
+
+
+def table_of(name: str, claims: Sequence[Claim], results: Mapping[str, Results]) -> str:
+    """
+    What stands in a marked place of the page.
+
+    :param name: of an experiment, ``"claims"`` or ``"runs"``
+    :param claims: all of them
+    :param results: experiment → what there is of it
+    :raises ValueError: for a place that nobody fills
+    """
+    if name == "claims":
+        return claims_table(claims, results)
+    if name == "runs":
+        return runs_table(results)
+    if name not in results:
+        raise ValueError(f"there is no table {name}; there are claims, runs, {', '.join(results)}")
+    own = results[name]
+    if not own.cells:
+        return f"*Not measured yet: `python zoo/reproduce.py {name}`.*"
+    parts = [(effects_table if own.experiment.effects else results_table)(own)]
+    if own.scale != 1:
+        parts.append(f"At scale {own.scale:g}.")
+    for picture in cells_of_pictures(own):
+        titles = ", ".join(panel["title"] for panel in own.experiment.pictures[picture])
+        parts.append(f"![{own.experiment.title}: {titles}](images/{picture_name(picture)})")
+    return "\n\n".join(parts)
+
+
+# ---- pictures
+
+
+def draw_curves(axis: Axes, results: Results, cells: Sequence[str], of: str) -> None:
+    """A curve of each cell over the episodes: the IQM over seeds; beside it, what scripted policies reach."""
+    styles = line_styles({cell: results.algos[cell] for cell in cells})
+    for cell in cells:
+        episodes, values = curves(results.cells[cell], of)
+        draw_intervals(
+            axis, episodes, iqm_curve(values, _rng()), styles[cell][0], label_of(results.cells[cell][0]), styles[cell][1]
+        )
+    metric = of.rpartition("/")[2]
+    heights = {label: record["test"]["tests"]["own"]["mean"].get(metric) for label, record in results.scripted.items()}
+    if len(results.experiment.env_ids) == 1 and len(next(iter(results.experiment.scripted), {})) == 1:
+        chosen = ("oracle", "greedy-nearest", "random")
+        draw_references(axis, {label: heights[label] for label in chosen if heights.get(label) is not None})
+    axis.set_xlabel("training (episodes)")
+    axis.set_ylabel(described(metric))
+    draw_legend(axis, below=True)
+
+
+def curves(records: Sequence[Record], of: str) -> tuple[np.ndarray, np.ndarray]:
+    """
+    A curve of each run, as far as all have come.
+
+    :param records: seeds of one cell
+    :param of: ``curve/<evaluation>/<metric>``
+    :return: episodes, the median over runs (evaluations,), and values (evaluations, runs)
+    """
+    _, name, metric = of.split("/", 2)
+    own = [record["curve"][name] for record in records]
+    length = min(len(curve["steps"]) for curve in own)
+    episodes = np.median([curve["episodes"][:length] for curve in own], axis=0)
+    return episodes, np.array([curve[metric][:length] for curve in own]).T
+
+
+def draw_scatter(axis: Axes, results: Results, cells: Sequence[str], of: str) -> None:
+    """Returns of single episodes of the test, of the first seed of each cell."""
+    _, test, metric = of.split("/", 2)
+    styles = line_styles({cell: results.algos[cell] for cell in cells})
+    for cell in cells:
+        first = results.cells[cell][0]
+        returns = first["test"]["tests"][test]["returns"][metric]
+        axis.plot(
+            np.arange(len(returns)), returns, "o", markersize=2.5, alpha=0.5, color=styles[cell][0], label=label_of(first)
+        )
+    axis.set_xlabel(f"episode of the test (seed {results.cells[cells[0]][0]['identity']['seed']})")
+    axis.set_ylabel(described(metric))
+    draw_legend(axis, below=True)
+
+
+def draw_bars(axis: Axes, results: Results, cells: Sequence[str], of: str) -> None:
+    """The IQM of each cell with its interval and its seeds."""
+    styles = line_styles({label_of(results.cells[cell][0]): results.algos[cell] for cell in cells})
+    values = {label_of(results.cells[cell][0]): results.values(cell, of) for cell in cells}
+    draw_estimates(
+        axis, {label: iqm_of(own) for label, own in values.items()}, {label: styles[label][0] for label in values}, values
+    )
+    axis.set_xlabel(described(of.rpartition("/")[2]))
+    axis.xaxis.set_major_formatter(ScalarFormatter())
+
+
+def draw_rivals(axis: Axes, results: Results, cells: Sequence[str], of: str) -> None:
+    """How often the one side wins, and the other."""
+    for cell in cells:
+        teams = results.cells[cell][0]["identity"]["settings"]["teams"]
+        episodes, won = curves(results.cells[cell], of)
+        for (team, theirs), values, colour in zip(teams.items(), (won, 1 - won), SIDES, strict=True):
+            draw_intervals(axis, episodes, iqm_curve(values, _rng()), colour, f"{algo_label(theirs['algo'])} {team}")
+    axis.set_ylim(-0.03, 1.03)
+    axis.set_xlabel("training (episodes)")
+    axis.set_ylabel("win rate")
+    draw_legend(axis, below=True)
+
+
+PANELS: dict[str, Callable[[Axes, Results, Sequence[str], str], None]] = {
+    "curve": draw_curves,
+    "scatter": draw_scatter,
+    "estimates": draw_bars,
+    "rivals": draw_rivals,
+}
+"""Kind of a panel → what draws it."""
+
+
+def picture_name(name: str) -> str:
+    """File of a picture."""
+    return f"reproduce_{name}.png"
+
+
+def cells_of_pictures(results: Results) -> dict[str, list[list[str]]]:
+    """The pictures of which each panel has something to show: name → the cells in each panel."""
+    found = {
+        name: [[cell for cell in panel.get("cells", results.cells) if cell in results.cells] for panel in panels]
+        for name, panels in results.experiment.pictures.items()
+    }
+    return {name: cells for name, cells in found.items() if all(cells)}
+
+
+def draw_pictures(results: Results, folder: Path) -> list[Path]:
+    """
+    All pictures of an experiment, as far as there are records.
+
+    :param results: of the experiment
+    :param folder: where they go
+    :return: the files
+    """
+    made = []
+    for name, wanted in cells_of_pictures(results).items():
+        panels = results.experiment.pictures[name]
+        seeds = sorted({len(results.cells[cell]) for cells in wanted for cell in cells})
+        told = " to ".join(map(str, dict.fromkeys((seeds[0], seeds[-1]))))
+        title = f"{results.experiment.title}; seeds: {told}, scale: {results.scale:g}"
+        tallest = max(len(cells) if "estimates" in panel else 0 for panel, cells in zip(panels, wanted, strict=True))
+        figure, axes = new_figure(len(panels), title, (5.8, max(4.2, 0.42 * tallest)))
+        for axis, panel, cells in zip(axes, panels, wanted, strict=True):
+            (kind,) = panel.keys() & PANELS.keys()
+            PANELS[kind](axis, results, cells, panel[kind])
+            axis.set_title(panel["title"])
+        made.append(folder / picture_name(name))
+        save_figure(figure, made[-1])
+    return made
+
+
+def write_report(experiments: Mapping[str, Experiment], claims: Sequence[Claim], docs: Path, folder: Path) -> list[Path]:
+    """
+    Fill the page and draw the pictures, of the records alone.
+
+    :param experiments: all of them
+    :param claims: of the paper
+    :param docs: folder of the page and the pictures
+    :param folder: of the records
+    :return: the files
+    :raises ValueError: for a damaged record, and for a place of the page that nobody fills
+    """
+    results = {name: read_results(experiment, folder) for name, experiment in experiments.items()}
+    page = docs / PAGE
+    text = page.read_text(encoding="utf-8") if page.is_file() else blank_page(experiments)
+    written = filled(text, partial(table_of, claims=claims, results=results))
+    pictures = [path for own in results.values() for path in draw_pictures(own, docs / "images")]
+    write_text(page, written)
+    return [page, *pictures]
+
+
+def blank_page(experiments: Mapping[str, Experiment]) -> str:
+    """A page with all tables and no words."""
+    places = {"claims": "What the paper says", **{name: own.title for name, own in experiments.items()}, "runs": "Runs"}
+    parts = [f"## {title}\n\n<!-- table: {name} -->\n<!-- end -->" for name, title in places.items()]
+    return "\n\n".join(["# Reproduction", *parts]) + "\n"
