@@ -402,6 +402,15 @@ def test_claims_about_a_number_take_the_mean_of_the_late_curve():
     assert judged(Claim(**claim, lower=True, than=0.7), told).word == HOLDS
 
 
+def test_the_page_shows_the_largest_scale_that_a_verdict_can_be_given_of():
+    assert reproduce_report.scale_shown({0.1: [5, 6], 1.0: [5, 5]}, 2) == 1.0
+    assert reproduce_report.scale_shown({0.1: [5, 6], 1.0: [9, 4]}, 2) == 0.1
+    assert reproduce_report.scale_shown({0.1: [10, 10], 0.2: [5, 5], 1.0: [5]}, 2) == 0.2
+    assert reproduce_report.scale_shown({0.1: [2, 2], 1.0: [3]}, 2) == 0.1
+    assert reproduce_report.scale_shown({0.1: [], 1.0: [1]}, 2) == 1.0
+    assert reproduce_report.scale_shown({}, 2) == 0.0
+
+
 def test_effects_stand_beside_the_default_the_largest_first():
     told = results(default=[1.0, 1.1, 0.9, 1.0, 1.0], small=[1.2, 1.1, 1.3, 1.2, 1.2], large=[0.1, 0.2, 0.0, 0.1, 0.1])
     lines = [line.split(" | ") for line in reproduce_report.effects_table(told).splitlines()[2:]]
@@ -444,4 +453,4 @@ def test_records_of_different_scales_never_mix(tmp_path):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps(record("maddpg", seed, mean)))
     told = reproduce_report.read_results(experiment, tmp_path)
-    assert told.scale == 0.5 and told.values("maddpg", "test/own/x").tolist() == [7.0]
+    assert told.scale == 0.1 and told.values("maddpg", "test/own/x").tolist() == [1.0, 2.0, 3.0]  # of 0.5 there is one seed

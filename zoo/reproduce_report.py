@@ -46,7 +46,7 @@ class Results:
     The records of an experiment, all of one scale.
 
     :param experiment: the experiment
-    :param scale: share of its env steps; the largest of which there are records
+    :param scale: share of its env steps, see :func:`scale_shown`
     :param cells: cell → the records of its seeds, in the order of the experiment
     :param scripted: who plays every group → record
     """
@@ -75,8 +75,10 @@ def read_results(experiment: Experiment, folder: Path) -> Results:
     :raises ValueError: for a damaged record
     """
     scales = {float(path.name.removeprefix("scale_")): path for path in (folder / experiment.name).glob("scale_*")}
-    found = {scale: sorted(path.rglob("seed_*.json")) for scale, path in scales.items()}
-    scale = max((scale for scale, paths in found.items() if paths), default=0.0)
+    found = {scale: list(path.rglob("seed_*.json")) for scale, path in scales.items()}
+    scale = scale_shown(
+        {scale: list(Counter(own.parent for own in paths).values()) for scale, paths in found.items()}, len(experiment.cells)
+    )
     records = sorted(map(read_record, found.get(scale, ())), key=lambda record: record["identity"]["seed"])
     cells: dict[str, list[Record]] = {}
     for record in records:
@@ -85,6 +87,22 @@ def read_results(experiment: Experiment, folder: Path) -> Results:
     paths = {" against ".join(own.values()): experiment.scripted_record(folder, own) for own in experiment.scripted}
     scripted = {label: read_record(path) for label, path in paths.items() if path.is_file()}
     return Results(experiment, scale, ordered, scripted)
+
+
+def scale_shown(n_seeds: Mapping[float, Sequence[int]], n_cells: int) -> float:
+    """
+    The largest scale at which every cell has the seeds for a verdict; while there is none, the one that comes nearest to it.
+
+    :param n_seeds: scale → of each cell that has records how many
+    :param n_cells: of the experiment
+    :return: 0 if there is no record
+    """
+
+    def rank(scale: float) -> tuple[int, float]:
+        every_cell_has = min(n_seeds[scale]) if len(n_seeds[scale]) >= n_cells else 0
+        return min(every_cell_has, ENOUGH_RUNS), scale
+
+    return max((scale for scale, counts in n_seeds.items() if counts), key=rank, default=0.0)
 
 
 def quantity(record: Record, of: Quantity, since: float = 0.0) -> float:
