@@ -17,6 +17,7 @@ from sb3_kfcv.curriculum.difficulty import (
     mean_of_the_living,
     rank_correlation,
     rows_to_score,
+    seen_errors,
     stratum_weights,
 )
 from sb3_kfcv.curriculum.folds import assign_folds, rows_per_fold
@@ -233,6 +234,18 @@ def test_eq_10_and_11_by_hand():
     assert cross_validated_errors(Y, Q_TEACHER, FOLDS).tolist() == ERRORS
 
 
+def test_the_error_of_the_teacher_that_has_seen_it_by_hand():
+    """Transition j is of fold j. Agent 0: (1−0)², (2−1)², (3−3)²; agent 1: (10−10)², (0−0)², (−10+10)²."""
+    assert seen_errors(Y, Q_TEACHER, FOLDS).tolist() == [[1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]
+
+
+def test_scores_below_zero_are_in_units_of_other_errors():
+    """Units 2 and 10: (−4/2 + 20/10) / 2, (2/2 − 10/10) / 2, (6/2 + 0) / 2; agent 1 is dead in the last one: 6/2."""
+    errors, unit = th.tensor([[-4.0, 2.0, 6.0], [20.0, -10.0, 7.0]]), th.tensor([[1.0, 2.0, 3.0], [5.0, 15.0, 99.0]])
+    scores = combine_agents(errors, th.tensor([[1.0, 1, 1], [1, 1, 0]]), unit=unit)
+    assert scores.tolist() == [0.0, 0.0, 3.0]
+
+
 def test_scores_are_relative_to_each_agents_mean():
     """Means 22/3 and 400. (4·3/22 + 500/400) / 2, (5·3/22 + 200/400) / 2, (13·3/22 + 500/400) / 2."""
     scores = combine_agents(th.tensor(ERRORS), th.ones(2, 3))
@@ -272,6 +285,31 @@ def test_the_buffer_scores_each_transition_by_the_teachers_that_have_not_seen_it
                     errors[agent, j] += float(y[agent, j] - values[teacher, agent, 0]) ** 2
     expected = (errors / errors.mean(axis=1, keepdims=True)).mean(axis=0)
     np.testing.assert_allclose(buffer.scores, expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("score", ["seen", "reducible"])
+def test_the_controls_of_the_teachers_scores(score):
+    """Against a loop over transitions and teachers. The student's Q is 0, so its δ² is the squared reward."""
+    buffer = make_buffer(size=40, n_agents=2, score=score)
+    buffer.sample(4)
+    y = th.as_tensor(buffer.rewards[:, 0].T)
+    spread = y.std(1, keepdim=True, unbiased=False)
+    student, y = (y / spread).square().numpy(), (y - y.mean(1, keepdim=True)) / spread
+    seen, unseen = np.zeros((2, 40)), np.zeros((2, 40))
+    for j in range(40):
+        with th.no_grad():
+            values = buffer.teachers.values(th.as_tensor(buffer.observations[j]).unsqueeze(0))
+        for agent in range(2):
+            for teacher in range(3):
+                error = float(y[agent, j] - values[teacher, agent, 0]) ** 2
+                if buffer.folds[j] == teacher:
+                    seen[agent, j] = error
+                else:
+                    unseen[agent, j] += error / 2
+    errors, unit = {"seen": (seen, seen), "reducible": (student - unseen, student)}[score]
+    expected = (errors / unit.mean(axis=1, keepdims=True)).mean(axis=0)
+    np.testing.assert_allclose(buffer.scores, expected, rtol=1e-3, atol=1e-5)
+    assert (buffer.scores < 0).any() == (score == "reducible")
 
 
 def test_dead_agents_weigh_nothing_however_large_their_errors_are():

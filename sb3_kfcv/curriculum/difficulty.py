@@ -23,6 +23,16 @@ def cross_validated_errors(targets: th.Tensor, teacher_values: th.Tensor, folds:
     return squared.sum(0) - own
 
 
+def seen_errors(targets: th.Tensor, teacher_values: th.Tensor, folds: th.Tensor) -> th.Tensor:
+    """
+    ``(y_j − Q_fold(j))²``: the error of the one teacher that was trained on the transition, the control for cross validation.
+
+    The parameters and what is returned are those of :func:`cross_validated_errors`.
+    """
+    own = teacher_values.gather(0, folds.expand(1, *targets.shape)).squeeze(0)
+    return (targets - own).square()
+
+
 def mean_of_the_living(values: th.Tensor, live: th.Tensor, weights: th.Tensor | None = None) -> th.Tensor:
     """
     Mean over the transitions in which each agent lived.
@@ -36,7 +46,9 @@ def mean_of_the_living(values: th.Tensor, live: th.Tensor, weights: th.Tensor | 
     return (values * counted).sum(1, keepdim=True) / counted.sum(1, keepdim=True).clamp(min=1)
 
 
-def combine_agents(errors: th.Tensor, live: th.Tensor, weights: th.Tensor | None = None) -> np.ndarray:
+def combine_agents(
+    errors: th.Tensor, live: th.Tensor, weights: th.Tensor | None = None, unit: th.Tensor | None = None
+) -> np.ndarray:
     """
     One score per transition: each agent's errors over their mean, so that no agent's reward scale rules, averaged over
     the agents alive in the transition.
@@ -44,9 +56,10 @@ def combine_agents(errors: th.Tensor, live: th.Tensor, weights: th.Tensor | None
     :param errors: (agents, n)
     :param live: 1 where the agent lived, (agents, n)
     :param weights: how much each transition counts in the mean, at least 1; by default all the same, (n,)
+    :param unit: errors whose mean takes the place of their own, where these may be below 0, (agents, n)
     :return: (n,) scores; 0 where nobody lived
     """
-    mean = mean_of_the_living(errors, live, weights)
+    mean = mean_of_the_living(errors if unit is None else unit, live, weights)
     relative = errors * live / mean.clamp(min=th.finfo(errors.dtype).tiny)
     return (relative.sum(0) / live.sum(0).clamp(min=1)).cpu().numpy()
 

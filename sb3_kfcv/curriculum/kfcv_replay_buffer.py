@@ -23,6 +23,7 @@ from sb3_kfcv.curriculum.difficulty import (
     mean_of_the_living,
     rank_correlation,
     rows_to_score,
+    seen_errors,
     stratum_weights,
 )
 from sb3_kfcv.curriculum.folds import assign_folds, rows_per_fold
@@ -30,7 +31,7 @@ from sb3_kfcv.curriculum.stages import STAGE_RULES, BucketMembers, bucket_shares
 from sb3_kfcv.curriculum.teachers import Teachers
 from sb3_kfcv.replay.joint_replay_buffer import JointReplayBuffer, Student
 
-SCORES = ("teachers", "student")
+SCORES = ("teachers", "seen", "student", "reducible")
 
 # Rows that pass through the networks at once during a refresh: bounds the memory of their activations.
 CHUNK = 1024
@@ -75,7 +76,9 @@ class KFCVReplayBuffer(JointReplayBuffer):
         see :func:`~sb3_kfcv.curriculum.stages.bucket_shares`
     :param lambda_init: Table 1's "initial curriculum factor λ": the uniform share at the start; 0 is section 4.2 to the letter
     :param curriculum_fraction: share of training that the curriculum takes
-    :param score: ``"teachers"``, or the control ``"student"``: the learner's own squared TD error
+    :param score: ``"teachers"``, or a control: ``"seen"``, the error of the one teacher that was trained on the transition
+        (no cross validation); ``"student"``, the learner's own squared TD error; ``"reducible"``, the learner's minus the mean
+        of the teachers that have not seen it: what is still to be learnt, without what is noise to all
 
     The other parameters are those of :class:`~sb3_kfcv.replay.JointReplayBuffer`.
     """
@@ -258,12 +261,17 @@ class KFCVReplayBuffer(JointReplayBuffer):
             return
         weights = th.as_tensor(stratum_weights(known, rows), device=self.device)
         inputs, targets, live = self._assessed(rows)
-        compared = slice(None, None, 1 if self.score == "student" else -(-len(rows) // COMPARED))
+        compared = slice(None, None, 1 if self.score in ("student", "reducible") else -(-len(rows) // COMPARED))
         student_errors = (targets[:, compared] - self._student_values(rows[compared])).square()
         if self.score == "student":
             scores = combine_agents(student_errors, live, weights)
         else:
-            scores = self._teacher_scores(inputs, targets, live, weights, self.folds[rows], members)
+            errors, variances = self._teacher_errors(inputs, targets, live, weights, self.folds[rows], members)
+            if self.score == "reducible":
+                of_student = student_errors / variances
+                scores = combine_agents(of_student - errors / (self.n_folds - 1), live, weights, unit=of_student)
+            else:
+                scores = combine_agents(errors, live, weights)
         self._note_correlations(rows, scores, compared, combine_agents(student_errors, live[:, compared]))
         if self.stage_rule == "random":
             scores = self.rng.random(len(rows))
@@ -293,7 +301,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
         """The student's Q, (agents, n)."""
         return th.cat([self.student.q_values(self.rows(rows[part])) for part in slices(len(rows))], dim=1)
 
-    def _teacher_scores(
+    def _teacher_errors(
         self,
         inputs: th.Tensor,
         targets: th.Tensor,
@@ -301,22 +309,28 @@ class KFCVReplayBuffer(JointReplayBuffer):
         weights: th.Tensor,
         folds: np.ndarray,
         members: list[np.ndarray],
-    ) -> np.ndarray:
-        """Train the teachers on their folds, and score every row by those that have not seen it (eq. 9–11): (n,)."""
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Train the teachers on their folds, and take the errors of those that have not seen each row (eq. 9–11): (agents, n) in
+        units of the variance of each agent's targets, and these variances, (agents, 1).
+        """
         # Targets in units of their own spread: eq. 9 has the same minimum, and few steps come near it.
         targets = targets - mean_of_the_living(targets, live, weights)
-        targets = targets / mean_of_the_living(targets.square(), live, weights).sqrt().clamp(min=1e-6)
+        spreads = mean_of_the_living(targets.square(), live, weights).sqrt().clamp(min=1e-6)
+        targets = targets / spreads
         steps = self.teacher_steps if self.n_refreshes else self.first_teacher_steps
         in_fold_loss = self.teachers.fit(inputs, targets, live, members, steps, self.teacher_batch_size, self.rng)
         errors, fold = th.empty_like(targets), th.as_tensor(folds, device=self.device)
+        rule = seen_errors if self.score == "seen" else cross_validated_errors
         with th.no_grad():
             for part in slices(len(folds)):
                 values = self.teachers.values(inputs[part].unsqueeze(0))
-                errors[:, part] = cross_validated_errors(targets[:, part], values, fold[part])
-        held_out_loss = (errors * live).sum() / live.sum().clamp(min=1) / (self.n_folds - 1)
+                errors[:, part] = rule(targets[:, part], values, fold[part])
         self._stats["curriculum/teacher_loss_in_fold"] = in_fold_loss
-        self._stats["curriculum/teacher_loss_held_out"] = held_out_loss.item()
-        return combine_agents(errors, live, weights)
+        if self.score != "seen":
+            held_out_loss = (errors * live).sum() / live.sum().clamp(min=1) / (self.n_folds - 1)
+            self._stats["curriculum/teacher_loss_held_out"] = held_out_loss.item()
+        return errors, spreads.square()
 
     def _note_correlations(self, rows: np.ndarray, scores: np.ndarray, compared: slice, student_scores: np.ndarray) -> None:
         """How the ranking agrees with the scores before, and with the student's own squared TD error."""
