@@ -263,7 +263,10 @@ def _draw_scores(axis: Axes, series: Sequence[Mapping[str, Series]], n_folds: in
             axis.plot(median.steps, median.values, color=colour, label=label)
             axis.fill_between(median.steps, low.values, high.values, color=colour, alpha=0.2 / len(series), linewidth=0)
             label = ""
-    axis.set_yscale("log")
+    if axis.dataLim.y0 > 0:
+        axis.set_yscale("log")
+    else:  # reducible errors
+        axis.set_yscale("symlog", linthresh=0.1)
     axis.set_ylabel("difficulty score (mean = 1)\nmedian, 10 % to 90 %")
     axis.legend(fontsize="x-small")
 
