@@ -414,6 +414,20 @@ def test_k_equal_stages_then_the_whole_buffer():
     assert {progress: stage_at(progress, 0.4, 4) for progress in at} == at
 
 
+def test_stages_that_begin_anew_with_every_refresh():
+    """K = 3, a refresh every 6 updates: two updates a stage, over and over, until the curriculum's share is over."""
+    buffer = make_buffer(stage_clock="refresh", refresh_every=6, refresh_fraction=10.0, curriculum_fraction=0.5)
+    buffer.progress = 0.1
+    stages = []
+    for _ in range(13):
+        buffer.sample(4)
+        stages.append(buffer.stage)
+    assert buffer.n_refreshes == 3
+    assert stages == [1, 1, 2, 2, 3, 3, 1, 1, 2, 2, 3, 3, 1]
+    buffer.progress = 0.5
+    assert buffer.stage == 4
+
+
 def test_no_curriculum_at_all():
     assert stage_at(0.0, 0.0, 5) == 6
     assert uniform_share(0.0, 0.0, 0.1) == 1
@@ -899,6 +913,7 @@ def test_ages_that_are_none_are_refused(wrong):
     [
         ({"n_folds": 61}, r"n_folds.*60.*61"),
         ({"n_folds": 1}, r"n_folds.*got 1"),
+        ({"stage_clock": "refreshes"}, r'unknown stage_clock "refreshes".*"refresh"'),
         ({"stage_rule": "cumulativ"}, r'unknown stage_rule "cumulativ".*"cumulative"'),
         ({"score": "teacher"}, r'unknown score "teacher".*"teachers"'),
         ({"lambda_init": 1.2}, r"lambda_init.*1\.2"),

@@ -349,6 +349,7 @@ SETUPS = {
     "normalised": lambda: small(KFCVMADDPG, VecNormalize(grassland(), norm_reward=False)),
     "trained every two episodes": lambda: small(MADDPG, grassland(1), train_freq=(2, "episode"), gradient_steps=-1),
     "trained every seven steps": lambda: small(PERMADDPG, grassland(), train_freq=(7, "step"), gradient_steps=-1),
+    "stages per refresh": lambda: small(KFCVMADDPG, grassland(), replay_buffer_kwargs={"stage_clock": "refresh"}),
     "random stages": lambda: small(KFCVMADDPG, grassland(), replay_buffer_kwargs={"stage_rule": "random"}),
     "the student's scores": lambda: small(KFCVMADDPG, grassland(), replay_buffer_kwargs={"score": "student"}),
     "buffer smaller than the way between checkpoints": lambda: small(PERMADDPG, grassland(), buffer_size=24),

@@ -31,6 +31,7 @@ from sb3_kfcv.curriculum.stages import STAGE_RULES, BucketMembers, bucket_shares
 from sb3_kfcv.curriculum.teachers import Teachers
 from sb3_kfcv.replay.joint_replay_buffer import JointReplayBuffer, Student
 
+STAGE_CLOCKS = ("training", "refresh")
 SCORES = ("teachers", "seen", "student", "reducible")
 
 # Rows that pass through the networks at once during a refresh: bounds the memory of their activations.
@@ -74,6 +75,8 @@ class KFCVReplayBuffer(JointReplayBuffer):
     :param teacher_net_arch: hidden sizes of the teachers; wider than the student's, since one network serves all agents
     :param stage_rule: ``"cumulative"``, ``"bucket"``, or the controls ``"anti"`` (hard to easy) and ``"random"``;
         see :func:`~sb3_kfcv.curriculum.stages.bucket_shares`
+    :param stage_clock: ``"training"``: the K stages take the curriculum's share of training; ``"refresh"``, the other reading
+        of section 4.2: they begin anew with every refresh, and take as long as there was between the last two
     :param lambda_init: Table 1's "initial curriculum factor λ": the uniform share at the start; 0 is section 4.2 to the letter
     :param curriculum_fraction: share of training that the curriculum takes
     :param score: ``"teachers"``, or a control: ``"seen"``, the error of the one teacher that was trained on the transition
@@ -106,6 +109,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
         teacher_learning_rate: float = 1e-3,
         teacher_net_arch: Sequence[int] = (128, 128),
         stage_rule: str = "cumulative",
+        stage_clock: str = "training",
         lambda_init: float = 0.1,
         curriculum_fraction: float = 0.5,
         score: str = "teachers",
@@ -119,6 +123,8 @@ class KFCVReplayBuffer(JointReplayBuffer):
             raise ValueError(f"n_folds must lie between 2 and the buffer's {n_rows} transitions, got {n_folds}")
         if stage_rule not in STAGE_RULES:
             raise ValueError(unknown_name("stage_rule", stage_rule, STAGE_RULES))
+        if stage_clock not in STAGE_CLOCKS:
+            raise ValueError(unknown_name("stage_clock", stage_clock, STAGE_CLOCKS))
         if score not in SCORES:
             raise ValueError(unknown_name("score", score, SCORES))
         for name, count in (("refresh_every", refresh_every), ("scored_per_update", scored_per_update)):
@@ -135,7 +141,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
         self.teacher_steps, self.first_teacher_steps = teacher_steps, first_teacher_steps
         self.teacher_batch_size = teacher_batch_size
         self.teacher_learning_rate, self.teacher_net_arch = teacher_learning_rate, tuple(teacher_net_arch)
-        self.stage_rule, self.score = stage_rule, score
+        self.stage_rule, self.stage_clock, self.score = stage_rule, stage_clock, score
         self.lambda_init, self.curriculum_fraction = lambda_init, curriculum_fraction
 
         self.folds = assign_folds(n_rows, n_folds, self.rng)  # (rows,)
@@ -145,6 +151,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
         self._members: BucketMembers | None = None  # made at the first draw after a ranking, with n_added of that time
         self._ranked_at = 0
         self._updates_since_refresh = 0
+        self._last_wait = refresh_every  # updates between the last two refreshes
         self._new_since_refresh = 0
         self.n_refreshes = 0
         self._warned = False
@@ -154,7 +161,10 @@ class KFCVReplayBuffer(JointReplayBuffer):
     @property
     def stage(self) -> int:
         """1 … K, and K + 1 when the curriculum is over."""
-        return stage_at(self.progress, self.curriculum_fraction, self.n_folds)
+        stage = stage_at(self.progress, self.curriculum_fraction, self.n_folds)
+        if self.stage_clock == "training" or stage > self.n_folds:
+            return stage
+        return min(1 + self.n_folds * self._updates_since_refresh // self._last_wait, self.n_folds)
 
     @property
     def lambda_now(self) -> float:
@@ -282,6 +292,8 @@ class KFCVReplayBuffer(JointReplayBuffer):
         scored = np.flatnonzero(self.buckets[:n] != UNSCORED)
         self.buckets[scored] = buckets_by_difficulty(self.scores[scored], self.n_folds)
         self._members = None
+        if self.n_refreshes:
+            self._last_wait = max(self._updates_since_refresh, 1)
         self._updates_since_refresh = self._new_since_refresh = 0
         self.n_refreshes += 1
         self._refresh_seconds += time.perf_counter() - start
@@ -375,6 +387,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
             **super().state(),
             **{name: getattr(self, name) for name in OF_EACH_ROW},
             "updates_since_refresh": self._updates_since_refresh,
+            "last_wait": self._last_wait,
             "new_since_refresh": self._new_since_refresh,
             "n_refreshes": self.n_refreshes,
             "warned": self._warned,
@@ -386,7 +399,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
     def set_state(self, state: dict[str, Any], transitions: dict[str, np.ndarray]) -> None:
         # A file without ages is of a time when each refresh scored all transitions.
         same_age = np.zeros(np.shape(state.get("scores", ())), dtype=np.int64)
-        super().set_state({"score_ages": same_age, **state}, transitions)
+        super().set_state({"score_ages": same_age, "last_wait": self.refresh_every, **state}, transitions)
 
     def _set_bookkeeping(self, state: dict[str, Any], rows: np.ndarray, own_rows: np.ndarray) -> None:
         size = state["n_steps"] * state["n_envs"]
@@ -405,6 +418,7 @@ class KFCVReplayBuffer(JointReplayBuffer):
             raise ValueError("not a replay buffer of this model: its scores have negative ages")
         for name in ("updates_since_refresh", "new_since_refresh", "n_refreshes"):
             require_count(name, state[name], least=0)
+        require_count("last_wait", state["last_wait"])
         require_between("refresh_seconds", state["refresh_seconds"], 0)
         stats = dict(state["stats"])
         for name, value in stats.items():
@@ -415,7 +429,8 @@ class KFCVReplayBuffer(JointReplayBuffer):
         for name in OF_EACH_ROW:
             values = getattr(self, name)
             values[slice(None) if same else own_rows] = state[name][slice(None) if same else rows]
-        self._updates_since_refresh, self._new_since_refresh = state["updates_since_refresh"], state["new_since_refresh"]
+        self._updates_since_refresh, self._last_wait = state["updates_since_refresh"], state["last_wait"]
+        self._new_since_refresh = state["new_since_refresh"]
         self.n_refreshes, self._warned = state["n_refreshes"], bool(state["warned"])
         self._members = None
         self._stats, self._refresh_seconds = stats, float(state["refresh_seconds"])
