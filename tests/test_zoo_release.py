@@ -9,6 +9,7 @@ import shutil
 import numpy as np
 import pytest
 import yaml
+from filelock import FileLock
 
 from sb3_kfcv import ALGOS, MADDPG, CoTraining, FileFormatError, load_normalization, make_vec_env
 from sb3_kfcv.common.evaluation import Interval
@@ -19,7 +20,7 @@ from tests.toy_runs import toy_run
 from zoo import enjoy, evaluate, match, plot, release, train
 from zoo.match_results import shown
 from zoo.run_folder import RunFolder
-from zoo.runs import Run
+from zoo.runs import Run, runs_below
 
 SIZES = {"n_wolves": 2, "n_sheep": 2, "n_grass": 1, "max_steps": 5}
 PARAMS = ["n_envs:2", "learning_starts:20", "batch_size:8", "buffer_size:200"]
@@ -290,7 +291,7 @@ def test_the_card_has_the_checksum_and_what_the_hub_reads(spread):
         head["tags"]
     )
     assert hashlib.sha256((spread / "HardSpread-v0.zip").read_bytes()).hexdigest() in card
-    assert "80 env steps" in card and "gamma: 0.99" in card
+    assert "80 env steps" in card and "gamma: 0.99" in card and "`HardSpread-v0` (agent × 2)" in card
 
 
 @pytest.mark.parametrize("which", ["spread", "wolves"])
@@ -330,6 +331,33 @@ def test_a_co_training_is_released_with_both_teams(logs, tmp_path, capsys):
     assert enjoy.main([str(folder), "--no-render", "-n", "1"]) == 0
 
 
+@pytest.mark.parametrize(("typed", "shown"), [("out", "out"), ("a/out", "a/out"), ("../out", "out"), ("{tmp}/b/out", "out")])
+def test_the_folder_as_the_card_names_it(typed, shown, tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert release.shown_place(typed.format(tmp=tmp_path)) == shown
+
+
+def test_a_run_that_is_not_at_its_end(logs, tmp_path, capsys):
+    """By itself it is released, and its card says at which step; beside others it is left out."""
+    for number in (1, 2):
+        shutil.copytree(run(logs, "HardSpread-v0", "kfcv_maddpg", number), tmp_path / "logs" / "a" / f"HardSpread-v0_{number}")
+    going_on = tmp_path / "logs" / "a" / "HardSpread-v0_1"
+    (going_on / "HardSpread-v0.zip").unlink()
+    shutil.copyfile(going_on / "best_model.zip", going_on / "rl_model_40_steps.zip")
+    steps = ALGOS["kfcv_maddpg"].load(going_on / "best_model.zip").num_timesteps
+    card = (released(tmp_path / "alone", going_on) / "README.md").read_text()
+    assert f"The run was not at its end: the model is of {steps} of 80 env steps." in card
+    assert "not at its end" not in (released(tmp_path / "both", tmp_path / "logs") / "README.md").read_text()
+    assert f"note: left out, since not at the end of the training: {going_on}" in capsys.readouterr().err
+    assert Run.at(tmp_path / "both" / "trained_agents" / "kfcv_maddpg" / "HardSpread-v0_1").seed == 2
+
+
+def test_the_worlds_that_measure_are_none_of_a_training():
+    """Of any seed that is drawn, of ten thousand worlds that evaluate."""
+    assert 2**31 + train.EVAL_SEED_OFFSET + 10_000 < release.FRESH_SEED < 2**32 - 10_000_000
+
+
 # ---- what is refused
 
 
@@ -345,7 +373,46 @@ def test_a_release_is_replaced_only_by_force(logs, tmp_path, capsys):
     assert release.main([*words, "--exp-id", "2"]) == 0
     assert sorted(path.name for path in folder.parent.iterdir()) == ["Grassland-v0_1", "Grassland-v0_2"]
     assert [path.name for path in (tmp_path / "trained_agents").iterdir()] == ["maddpg"]
-    assert "--exp-id 2" in (folder.parent / "Grassland-v0_2" / "README.md").read_text()
+    for number in (1, 2):  # without it the latest of both would play
+        text = (folder.parent / f"Grassland-v0_{number}" / "README.md").read_text()
+        assert text.count(f"-f trained_agents --exp-id {number}") == 3
+
+
+@pytest.mark.parametrize("moment", ["measure", "swap"])
+def test_a_kill_costs_no_release_and_leaves_no_run(moment, logs, tmp_path, monkeypatch, capsys):
+    """While it is measured, and between the two renames of the swap. What is left is no run; the next command removes it."""
+    releases = tmp_path / "trained_agents"
+    folder = released(tmp_path, run(logs))
+    (folder / "README.md").write_text("mine")
+    words = [str(run(logs)), "-n", "3", "-f", str(releases)]
+    swap = release.swap
+
+    def stop(new, *more):
+        if moment == "swap":
+            swap(new.with_name("missing"), *more)
+        raise FileNotFoundError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(release, moment, stop)
+        patch.setattr(release, "clear", lambda made: None)  # a killed command puts nothing in order
+        assert release.main([*words, "--force"]) == 2
+    capsys.readouterr()
+    (left,) = releases.glob(".*")
+    assert folder.exists() == (moment == "measure")
+    assert len(runs_below(releases)) == (moment == "measure")
+    assert release.main(words) == 2 and "is released already" in capsys.readouterr().err
+    assert (folder / "README.md").read_text() == "mine" and not left.exists()
+    assert release.main([*words, "--force"]) == 0
+    assert (folder / "README.md").read_text() != "mine" and not [*releases.glob(".*")]
+
+
+def test_the_folder_of_a_release_at_work_stays(tmp_path):
+    (tmp_path / ".release-a").mkdir()
+    with FileLock(tmp_path / ".release-a" / ".lock"):
+        assert release.main(["nothing", "-f", str(tmp_path)]) == 2
+        assert (tmp_path / ".release-a").is_dir()
+    assert release.main(["nothing", "-f", str(tmp_path)]) == 2
+    assert not (tmp_path / ".release-a").exists()
 
 
 def test_a_run_is_never_replaced(logs, capsys):
@@ -363,19 +430,50 @@ def test_the_best_model_of_a_run(logs, tmp_path):
     assert "the model of the run's best evaluation" in (folder / "README.md").read_text()
 
 
+def at_its_end(folder):
+    (folder / "Grassland-v0.zip").touch()
+    return folder
+
+
+@pytest.mark.parametrize(("content", "message"), [("[1]", "holds no map of versions"), ("{", "is no valid JSON")])
+def test_damaged_versions_are_refused_by_name(content, message, logs, tmp_path, capsys):
+    damaged = shutil.copytree(run(logs), tmp_path / "Grassland-v0_1")
+    file = damaged / "Grassland-v0" / "versions.json"
+    file.write_text(content)
+    assert release.main([str(damaged), "-f", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {file} {message}")
+
+
+def test_a_release_is_not_resumed(spread, capsys):
+    assert train.main(["--resume", str(spread)]) == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"error: {spread} was released for playing only") and "-i" not in printed.split(str(spread))[1]
+
+
 def test_bad_input(logs, spread, tmp_path, capsys):
     toys = tmp_path / "toys"
     for gamma in (0.9, 0.95):
-        toy_run(toys / "differing", config={"gamma": gamma})
-    toy_run(toys / "silent", seed=1)
-    toy_run(toys / "silent", seed=2, steps=())
+        at_its_end(toy_run(toys / "differing", config={"gamma": gamma}))
+    for seed, steps in ((1, (100, 200)), (2, ())):
+        at_its_end(toy_run(toys / "silent", seed=seed, steps=steps))
+    for n_timesteps in (200, 400):
+        at_its_end(toy_run(toys / "lengths", seed=n_timesteps, config={"n_timesteps": n_timesteps}))
+    twice = [at_its_end(toy_run(toys / "twice", seed=7)) for _ in range(2)]
+    damaged = at_its_end(toy_run(toys / "damaged"))
+    (damaged / "evaluations.npz").write_bytes((damaged / "evaluations.npz").read_bytes()[:-30])
     toy_run(toys / "begun")
+    for seed in (1, 2):
+        toy_run(toys / "all_begun", seed=seed)
     files = shutil.copytree(run(logs), toys / "maddpg" / "Grassland-v0_1")
     RunFolder.at(files).best_model.unlink()
     for words, message in (
         (["nothing"], "there is no run of zoo/train.py in nothing"),
         ([toys / "differing"], "MADDPG on Grassland-v0: the runs differ in gamma (0.9, 0.95); name only those"),
         ([toys / "silent"], "has no evaluations to choose by; name the run that is to be released"),
+        ([toys / "lengths"], f"n_timesteps (200 in {toys}/lengths/maddpg/Grassland-v0_1, 400 in {toys}/lengths/maddpg/Grass"),
+        ([toys / "twice"], f"{twice[0]} and {twice[1]} have the same seed, 7; name one of them alone"),
+        ([damaged], f"{damaged}/evaluations.npz cannot be read"),
+        ([toys / "all_begun"], "has come to its end; name the one that is to be released"),
         ([toys / "begun"], "has no model and no checkpoint yet"),
         ([files, "--load-best"], "has no best_model.zip; leave out --load-best"),
         ([spread], "HardSpread-v0.zip is a release already"),

@@ -50,6 +50,17 @@ def test_runs_of_a_sweep_lie_deeper(tmp_path):
     assert len(runs_below(tmp_path)) == 2
 
 
+def test_runs_of_a_reproduction_lie_deepest(tmp_path):
+    toy_run(tmp_path / "experiment" / "scale_1" / "gamma_0.9" / "seed_0")
+    assert len(runs_below(tmp_path)) == 1
+
+
+def test_hidden_folders_hold_no_runs(tmp_path):
+    toy_run(tmp_path / ".release-a")
+    assert runs_below(tmp_path) == []
+    assert len(runs_below(tmp_path / ".release-a")) == 1
+
+
 @pytest.mark.parametrize("word", ["", "logs/nothing", "logs/no*"])
 def test_a_word_that_means_no_run_is_refused(tmp_path, word):
     (tmp_path / "logs").mkdir()

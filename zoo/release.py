@@ -8,23 +8,27 @@ file.
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import each other as the package ``zoo``
 
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.saving.archive import open_archive
-from sb3_kfcv.saving.releases import release_model
+from sb3_kfcv.saving.releases import is_released, release_model
 from sb3_kfcv.saving.saveable import MODEL_KINDS
 from sb3_kfcv.teams.players import Mixture, roles_in, scripted_for
 from zoo import evaluate
@@ -33,9 +37,9 @@ from zoo.match_results import write_text
 from zoo.playing import main_quantities
 from zoo.release_card import Candidate, Card, Measured
 from zoo.run_folder import RunFolder, file_name, file_to_play
-from zoo.run_groups import Group, differences, grouped, rewards
+from zoo.run_groups import Group, differences, first_of, grouped, note, only
 from zoo.runs import Run, find_runs
-from zoo.series import evaluation_files
+from zoo.series import evaluation_files, evaluations
 from zoo.teams import with_some_sense
 
 DESCRIPTION = """\
@@ -50,8 +54,12 @@ EXAMPLES = (
 
 FOLDER = "trained_agents"
 
-# Of the first episode: far above the seeds of worlds that train, and of those that evaluate while training.
-FRESH_SEED = 2_000_000
+# Of the first episode: above all that trainings draw (below 2**31) and derive (a million and some more), yet of 32 bits.
+FRESH_SEED = 4_000_000_000
+
+# Folders in which releases are made, and within them what a new one replaces.
+BESIDE = ".release-"
+REPLACED = "replaced"
 
 # Flags that say nothing of how a run learnt: where its logs went, and to whom.
 OF_THE_PLACE = ("log_folder", "tensorboard_log", "track", "wandb_project_name", "wandb_entity", "wandb_tags", "run_name")
@@ -122,9 +130,8 @@ def plan(group: Group, args: argparse.Namespace) -> Release:
     :param args: the command line
     :raises ValueError: if they are not, if the best is not known, or if something else is where it goes
     """
-    differing = differences(group)
-    if differing:
-        raise ValueError(f"{group}: the runs differ in {', '.join(differing)}; name only those that are to be chosen from")
+    group = ended(group)
+    require_seeds(group)
     scores = {run: _score(run, args.load_best) for run in group.runs}
     for run, score in scores.items():
         if score is None and len(scores) > 1:
@@ -134,7 +141,7 @@ def plan(group: Group, args: argparse.Namespace) -> Release:
     model = folder.best_model if args.load_best else file_to_play(folder.path)
     if not model.is_file():
         raise ValueError(f"the run in {folder.path} has no best_model.zip; leave out --load-best to release its last model")
-    if _is_released(model):
+    if is_released(model):
         raise ValueError(f"{model} is a release already; release the run that it was made of")
     try:
         _ = folder.command, folder.versions
@@ -142,27 +149,62 @@ def plan(group: Group, args: argparse.Namespace) -> Release:
         raise ValueError(f"cannot read {error.filename}: {error.strerror}") from None
     target = RunFolder(Path(args.folder) / group.algo / f"{file_name(group.env_id)}_{args.exp_id}", group.env_id)
     if target.path.exists():
-        if not (target.last_model.is_file() and _is_released(target.last_model)):
+        if not (target.last_model.is_file() and is_released(target.last_model)):
             raise ValueError(f"{target.path} is there and is no release; say another folder with -f, or another --exp-id")
         if not args.force:
             raise ValueError(f"{target.path} is released already; --force replaces it, --exp-id puts another one beside it")
     return Release(group, chosen, model, [Candidate(run.seed, score) for run, score in scores.items()], target)
 
 
+def ended(group: Group) -> Group:
+    """
+    Of several runs those that came to their end; a note names the others. One that is alone may be at any step.
+
+    :param group: runs that are seeds of one another
+    :raises ValueError: if none did
+    """
+    going_on = [str(run.folder.path) for run in group.runs if not run.has_ended]
+    if not going_on or len(group.runs) == 1:
+        return group
+    if len(going_on) == len(group.runs):
+        raise ValueError(f"{group}: none of {first_of(going_on)} has come to its end; name the one that is to be released")
+    note(f"left out, since not at the end of the training: {first_of(going_on)}")
+    return only([group], [run for run in group.runs if run.has_ended])[0]
+
+
+def require_seeds(group: Group) -> None:
+    """
+    :param group: runs that are to be seeds of one another
+    :raises ValueError: if they differ in more than that, or if one seed is there twice
+    """
+    differing = differences(group)
+    lengths = {run.config.get("n_timesteps"): run.folder.path for run in group.runs}
+    if len(lengths) > 1:
+        differing.append(f"n_timesteps ({', '.join(f'{steps} in {path}' for steps, path in lengths.items())})")
+    if differing:
+        raise ValueError(f"{group}: the runs differ in {', '.join(differing)}; name only those that are to be chosen from")
+    seeds: dict[int, Run] = {}
+    for run in group.runs:
+        other = seeds.setdefault(run.seed, run)
+        if other is not run:
+            raise ValueError(
+                f"{other.folder.path} and {run.folder.path} have the same seed, {run.seed}; name one of them alone"
+            )
+
+
 def _score(run: Run, best: bool) -> float | None:
-    """The mean reward of the evaluation that a run is chosen by: the last, or the best; ``None`` without evaluations."""
-    means = rewards(run)
+    """
+    The mean reward of the evaluation that a run is chosen by: the last, or the best; ``None`` without evaluations.
+
+    :raises ValueError: if one of its files of evaluations is damaged
+    """
+    found = {name: evaluations(run.folder.path, name) for name in evaluation_files(run.folder.path)}
+    if "eval" not in found:
+        return None
+    if "results" not in found["eval"]:
+        raise ValueError(f"{evaluation_files(run.folder.path)['eval']} holds no rewards of evaluations")
+    means = found["eval"]["results"].mean(axis=1)
     return float(means.max() if best else means[-1]) if len(means) else None
-
-
-def _is_released(model: Path) -> bool:
-    """
-    Whether a model was released.
-
-    :raises FileFormatError: if it is damaged, or no model
-    """
-    with open_archive(model, *MODEL_KINDS) as archive:
-        return bool(archive.read("attributes").get("plays_only"))
 
 
 def portable(value: Any) -> Any:
@@ -275,6 +317,64 @@ def measure(words: Sequence[str], run: Path, shown_run: str, args: argparse.Name
     )
 
 
+def shown_place(folder: str) -> str:
+    """The folder of all releases as cards name it: from the working directory if it lies below it, else its last part."""
+    return portable(os.path.abspath(folder))
+
+
+@contextmanager
+def beside(folder: Path) -> Iterator[Path]:
+    """
+    A hidden folder to make a release in, gone at the end.
+
+    :param folder: where releases lie
+    """
+    made = Path(mkdtemp(prefix=BESIDE, dir=folder))
+    with FileLock(made / ".lock"):
+        try:
+            yield made
+        finally:
+            clear(made)
+
+
+def clear(made: Path) -> None:
+    """
+    Remove a folder in which a release was made; what it was to replace goes back to its place if that is empty.
+
+    :param made: the folder
+    """
+    for replaced in (made / REPLACED).glob("*/*"):
+        place = made.parent / replaced.relative_to(made / REPLACED)
+        if not place.exists():
+            replaced.rename(place)
+    shutil.rmtree(made)
+
+
+def clear_stale(folder: Path) -> None:
+    """
+    Remove what killed commands left; folders of those that are at work are locked.
+
+    :param folder: where releases lie
+    """
+    for made in folder.glob(f"{BESIDE}*"):
+        with suppress(Timeout), FileLock(made / ".lock", timeout=0):
+            clear(made)
+
+
+def swap(new: Path, target: Path, aside: Path) -> None:
+    """
+    Put a release in its place; an older one is set aside before.
+
+    :param new: the release
+    :param target: its place
+    :param aside: where to
+    """
+    if target.exists():
+        aside.parent.mkdir(parents=True)
+        target.rename(aside)
+    new.rename(target)
+
+
 def make(release: Release, args: argparse.Namespace) -> None:
     """
     Write a release, whole or not at all: it is made and measured beside its place.
@@ -283,14 +383,15 @@ def make(release: Release, args: argparse.Namespace) -> None:
     :param args: the command line
     """
     target, run = release.target, release.chosen
-    shown_folder = portable(args.folder)
+    within = target.path.relative_to(args.folder)
+    shown_folder = shown_place(args.folder)
     target.path.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=".release-", dir=args.folder) as beside:
-        folder = RunFolder(Path(beside) / target.path.relative_to(args.folder), target.env_id)
+    with beside(Path(args.folder)) as made:
+        folder = RunFolder(made / within, target.env_id)
         write_run(release, folder)
         with open_archive(folder.last_model, *MODEL_KINDS) as archive:
             attributes, normalized = archive.read("attributes"), "normalization" in archive
-        shown_run = (PurePosixPath(shown_folder) / target.path.relative_to(args.folder).as_posix()).as_posix()
+        shown_run = (PurePosixPath(shown_folder) / within.as_posix()).as_posix()
         layout = attributes["layout"]
         card = Card(
             Run(folder),
@@ -301,14 +402,13 @@ def make(release: Release, args: argparse.Namespace) -> None:
             normalized=normalized,
             candidates=release.candidates,
             best=args.load_best,
+            ended=run.has_ended,
             measured=[measure(words, folder.path, shown_run, args) for words in comparisons(layout, folder.last_model)],
             n_episodes=args.n_episodes,
             seed=args.seed,
         )
         write_text(folder.path / "README.md", card.text())
-        if target.path.exists():
-            shutil.rmtree(target.path)
-        folder.path.rename(target.path)
+        swap(folder.path, target.path, made / REPLACED / within)
     of = f"seed {run.seed}, the best of {release.group.size}" if len(release.group.runs) > 1 else f"seed {run.seed}"
     size = sum(file.stat().st_size for file in target.path.rglob("*") if file.is_file())
     print(f"{release.group}: {of}; written: {target.path}, {size / 1e6:.2f} MB", flush=True)
@@ -323,6 +423,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         args = make_parser().parse_all(argv)
+        clear_stale(Path(args.folder))
         for release in build(args):
             make(release, args)
     except REFUSALS as error:

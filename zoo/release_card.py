@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -69,6 +70,7 @@ class Card:
     :param normalized: whether it sees normalised observations
     :param candidates: the runs that it was chosen from
     :param best: whether it is the model of the best evaluation
+    :param ended: whether the run came to its end
     :param measured: what it reached
     :param n_episodes: of each evaluation
     :param seed: of the first episode
@@ -82,6 +84,7 @@ class Card:
     normalized: bool
     candidates: Sequence[Candidate]
     best: bool
+    ended: bool
     measured: Sequence[Measured]
     n_episodes: int
     seed: int
@@ -122,13 +125,17 @@ class Card:
 
     def _summary(self) -> str:
         return (
-            f"A trained model of sb3-kfcv: {learner(self.run)} (`{self.run.algo}`) in `{self.run.env_id}`, {self.layout}, "
+            f"A trained model of sb3-kfcv: {learner(self.run)} (`{self.run.algo}`) in `{self.run.env_id}` ({self._agents()}), "
             f"after {self.n_timesteps:,} env steps. It is for playing: the actors alone, as JSON and plain arrays, no pickle."
         )
 
+    def _agents(self) -> str:
+        """Such as ``wolf × 16, sheep × 12``."""
+        return ", ".join(f"{group} × {len(self.layout.members(group))}" for group in self.layout.group_names)
+
     def _usage(self) -> str:
-        run, exp_id = self.run, self.run.folder.number
-        words = f"--algo {run.algo} --env {run.env_id} -f {self.folder}" + (f" --exp-id {exp_id}" if exp_id > 1 else "")
+        run, folder = self.run, shlex.quote(self.folder)
+        words = f"--algo {run.algo} --env {run.env_id} -f {folder} --exp-id {run.folder.number}"
         shell = f"python zoo/enjoy.py {words}\npython zoo/record_video.py {words} -o film.gif\npython zoo/evaluate.py {words}"
         return f"```\n{shell}\n```\n\n```python\n{self._python()}\n```"
 
@@ -180,6 +187,9 @@ class Card:
     def _choice(self) -> str:
         which = "best" if self.best else "last"
         model = "It is the model of the run's best evaluation. " if self.best else ""
+        if not self.ended:
+            planned = self.run.config["n_timesteps"]
+            model += f"The run was not at its end: the model is of {self.n_timesteps:,} of {planned:,} env steps. "
         if len(self.candidates) == 1:
             return f"{model}It was the only run to choose from. The command that trained it:"
         rewards = ", ".join(f"seed {seed}: {reward:.2f}" for seed, reward in self.candidates)
@@ -191,8 +201,8 @@ class Card:
     def _limits(self) -> str:
         limits = [
             "It cannot be trained on: critics, target networks and optimisers are left out.",
-            f"It plays in worlds of the same agents, {self.layout}, and refuses others. It was measured in the world of its "
-            "training alone.",
+            f"It plays in worlds of the same agents ({self._agents()}) with the same observations and actions, and refuses "
+            "others. It was measured in the world of its training alone.",
             "The intervals are over episodes, of this one training. With another seed the same command ends elsewhere.",
         ]
         if len(self.candidates) > 1:

@@ -172,8 +172,19 @@ class RunFolder:
 
     @property
     def versions(self) -> dict[str, str]:
-        """Versions of Python and the libraries with which it was begun."""
-        return json.loads(self.config_file.with_name("versions.json").read_text(encoding="utf-8"))
+        """
+        Versions of Python and the libraries with which it was begun.
+
+        :raises ValueError: if the file holds something else
+        """
+        file = self.config_file.with_name("versions.json")
+        try:
+            versions = json.loads(file.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"{file} is no valid JSON: {error}") from None
+        if not isinstance(versions, dict):
+            raise ValueError(f"{file} holds no map of versions")
+        return versions
 
     def describe(
         self,

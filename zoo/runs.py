@@ -15,8 +15,8 @@ from sb3_kfcv.common.naming import unknown_name
 from zoo.hyperparams import Hyperparams, check
 from zoo.run_folder import RunFolder, file_name, read_map
 
-# How deep below a folder runs may lie: <sweep>/<cell>/<algo>/<env>_<k>.
-DEPTH = 5
+# How deep below a folder runs may lie: <experiment>/<scale>/<setting>/<seed>/<algo>/<env>_<k>/<env> of a reproduction.
+DEPTH = 7
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,8 @@ class Run:
 def runs_below(path: str | Path) -> list[Run]:
     """
     The runs in a folder: the folder itself if it is one, else all that lie in it, such as in a log folder or in a sweep, in
-    the natural order of their paths. Damaged ones among many are left out, which a note tells.
+    the natural order of their paths. Hidden folders hold what is not finished, and are left out. Damaged runs among many are
+    left out, too, which a note tells.
 
     :raises ValueError: if the folder itself is a damaged run
     """
@@ -99,7 +100,8 @@ def runs_below(path: str | Path) -> list[Run]:
     own = _run_in(path)
     if own:
         return own
-    found = {file.parent.parent for depth in range(2, DEPTH + 1) for file in path.glob("*/" * depth + "args.yml")}
+    patterns = ("*/" * depth + "args.yml" for depth in range(2, DEPTH + 1))
+    found = {(path / file).parent.parent for pattern in patterns for file in glob.glob(pattern, root_dir=path)}
     return [run for folder in sorted(found, key=lambda folder: natural(str(folder))) for run in _or_note(_run_in, folder)]
 
 

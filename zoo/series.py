@@ -75,7 +75,7 @@ def evaluations(folder: str | Path, name: str = "eval") -> dict[str, np.ndarray]
     try:
         with np.load(files[name], allow_pickle=False) as arrays:
             return {key: arrays[key] for key in arrays.files}
-    except (OSError, EOFError, ValueError, BadZipFile) as error:
+    except (OSError, EOFError, ValueError, TypeError, RuntimeError, BadZipFile) as error:
         raise ValueError(f"{files[name]} cannot be read: {error}") from None
 
 

@@ -35,6 +35,7 @@ from sb3_kfcv.maddpg import MADDPG
 from sb3_kfcv.saving import FileFormatError
 from sb3_kfcv.saving.checkpoints import Checkpoint, Checkpoints, ResumeError, checkpoints_in, latest_checkpoint
 from sb3_kfcv.saving.normalization import load_normalization
+from sb3_kfcv.saving.releases import is_released
 from sb3_kfcv.saving.saveable import refusals
 from sb3_kfcv.teams.team_policy import TeamPolicy
 from sb3_kfcv.vec_env.make import facts_of, layout_of, make_vec_env, metric_names_of
@@ -321,6 +322,10 @@ def as_begun(args: argparse.Namespace, given: Sequence[str]) -> tuple[argparse.N
             raise ValueError(f"a resumed run keeps its settings: leave out {flag}, or train its model on with -i in a new run")
     folder = RunFolder.existing(args.resume)
     if folder.last_model.exists():
+        if is_released(folder.last_model):
+            raise ValueError(
+                f"{folder.path} was released for playing only, and cannot be trained on; to train one, start a new run"
+            )
         raise ValueError(f"the run in {folder.path} has ended; to train its model on: -i {folder.last_model} -n STEPS")
     begun = argparse.Namespace(**{**vars(make_parser().parse_all([])), **read_map(folder.arguments_file)})
     for name in ("resume", *(name for name in given if name in FREE_WHEN_RESUMED)):

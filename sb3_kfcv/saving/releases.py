@@ -48,5 +48,16 @@ def release_model(source: str | Path, target: str | Path) -> None:
     write_archive(target, "model", sections)
 
 
+def is_released(model: str | Path) -> bool:
+    """
+    Whether a model was released for playing only.
+
+    :param model: path of a model or a checkpoint
+    :raises FileFormatError: if it is damaged, or of another kind
+    """
+    with open_archive(existing(model), *MODEL_KINDS) as archive, refusals(archive, "attributes"):
+        return bool(archive.read("attributes").get("plays_only"))
+
+
 def _for_playing(attributes: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in without_retired(dict(attributes)).items() if name not in OF_THE_TRAINING}
