@@ -4,6 +4,7 @@ and that tables, verdicts and pictures say what the records hold.
 """
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from test_zoo import ROOT
 
 from sb3_kfcv.common.evaluation import Interval
 from zoo import pages, reproduce, reproduce_report, reproduce_run, train
-from zoo.reproduce_plan import EXPERIMENTS, Claim, Experiment, is_there, planned, read_experiments, read_record
-from zoo.reproduce_report import CANNOT_BE_TOLD, HOLDS, HOLDS_NOT, Results, judged, word_for
+from zoo.reproduce_plan import EXPERIMENTS, Claim, Experiment, planned, read_experiments
+from zoo.reproduce_records import is_there, read_record
+from zoo.reproduce_report import CANNOT_BE_TOLD, HOLDS, HOLDS_NOT, NOT_A_NUMBER, Results, judged, word_for
 from zoo.statistics import difference_with_interval, smallest_difference
 
 SMALL = {"n_envs": 2, "learning_starts": 20, "batch_size": 8, "buffer_size": 200}
@@ -61,8 +63,9 @@ TINY = {
 
 
 def changed(**changes):
-    """The tiny experiment with other keys, and no claim."""
-    return {"experiments": {"spread": {**TINY["experiments"]["spread"], **changes}}}
+    """The tiny experiment with other keys, and no claim; nothing is said of columns that it has no more."""
+    about_columns = {"better": {}, "published": {}} if "columns" in changes else {}
+    return {"experiments": {"spread": {**TINY["experiments"]["spread"], **about_columns, **changes}}}
 
 
 def write(folder, given=TINY):
@@ -77,9 +80,13 @@ def command(folder, *words, target="table2"):
     return [*targets, *places, "--scale", "0.5", "--seeds", "1", "--test-episodes", "40", "--local", *words]
 
 
-def wanted(folder):
+def wanted(folder, n_test_episodes=40, scale=0.5, n_seeds=1):
     (experiment,) = read_experiments(folder / "experiments.yml")[0].values()
-    return planned(experiment, 0.5, folder / "runs", reproduce.records_folder(folder / "docs"), 1, 40)
+    return planned(experiment, scale, folder / "runs", reproduce.records_folder(folder / "docs"), n_seeds, n_test_episodes)
+
+
+def report(folder, *words):
+    return ["--report", "-conf", str(folder / "experiments.yml"), "-o", str(folder / "docs"), *words]
 
 
 def without_clocks(record):
@@ -152,16 +159,18 @@ def test_a_run_that_has_its_record_is_never_run_again(made, capsys, monkeypatch)
     out = capsys.readouterr().out.splitlines()
     assert out[2].startswith("begin  spread maddpg seed 1, 200 env steps, about 0:00:")
     assert out[-2] == "4 runs: 2 to begin, 0 to go on with, 2 done" and out[-1].startswith("about 0:00:")
+    assert reproduce.main(command(made, "--dry-run", "--scale", "1", "--cells", "maddpg")) == 0
+    out = capsys.readouterr().out.splitlines()  # by the records of the other scale
+    assert out[0].startswith("begin  spread maddpg seed 0, 400 env steps, about 0:00:")
+    assert out[1] == "1 run: 1 to begin, 0 to go on with, 0 done"
 
 
-def test_the_page_is_made_of_the_records_alone(made, tmp_path, capsys):
+def test_the_page_is_made_of_the_records_alone(made):
     page = made / "docs" / "reproduction.md"
     before = page.read_text()
     page.write_text(f"words by hand\n\n{before}")
-    elsewhere = command(made, "--report", "-f", str(tmp_path / "no_runs"), target=None)
-    assert reproduce.main(elsewhere) == 0
+    assert reproduce.main(report(made)) == 0
     assert page.read_text() == f"words by hand\n\n{before}"
-    assert not (tmp_path / "no_runs").exists()
 
 
 def test_a_killed_run_goes_on_to_the_same_record(made, tmp_path, monkeypatch, capsys):
@@ -196,7 +205,8 @@ def test_a_killed_run_goes_on_to_the_same_record(made, tmp_path, monkeypatch, ca
 
 def test_the_test_is_not_played_again_from_a_checkpoint_behind_it(tmp_path):
     measure = reproduce_run.Measure(None, {"own": {}}, 2, tmp_path / "measured.json")
-    measure.set_state({"test": {"after": 190}, "taken": {"wall": 5.0, "processor": 4.0, "memory": 7e12}})
+    taken = {"wall": 5.0, "processor": 4.0, "memory": 7e12}
+    measure.set_state({"of": {"tests": {"own": {}}, "test_episodes": 2}, "test": {"after": 190}, "taken": taken})
     measure.num_timesteps = 200
     assert measure._on_step()  # without a model it could not play
     assert measure.test == {"after": 190}
@@ -223,19 +233,105 @@ def test_a_record_of_other_settings_is_refused(made, capsys):
     path = wanted(made)[0].path
     assert capsys.readouterr().err == (
         f"error: the record {path} was measured with settings.gamma 0.99, and is now to have 0.5; choose another scale, or "
-        "other settings by another name, or remove the record to measure anew\n"
+        "other settings by another name, or remove the record and its run to measure anew\n"
     )
     assert reproduce.main(command(made, "--test-episodes", "30")) == 2
     assert "was measured with test_episodes 40, and is now to have 30" in capsys.readouterr().err
+    (second,) = (own for own in wanted(made, 30, n_seeds=2) if own.cell == "maddpg" and own.run.seed == 1)
+    with pytest.raises(ValueError, match=f"the record {path} was measured with test_episodes 40, and is now to have 30"):
+        reproduce.check_records([second])  # could not be shown beside the first
     assert reproduce.main(command(made, "--scale", "0.25", "--dry-run")) == 0  # lies apart
 
 
 def test_a_damaged_record_is_told(made, tmp_path):
     path = tmp_path / "seed_0.json"
-    for text, sentence in (("{", "cannot be read: "), ("[]", "is no record of zoo/reproduce.py")):
+    good = wanted(made)[0].path.read_text()
+
+    def with_other(change):
+        record = json.loads(good)
+        change(record)
+        return json.dumps(record)
+
+    for text, sentence in (
+        ("{", "cannot be read: "),
+        ("[]", "is no record of zoo/reproduce.py"),
+        ('{"identity": 3}', "is no record of zoo/reproduce.py"),
+        (with_other(lambda record: record.pop("taken")), "seed_0.json is damaged: its taken is missing, or of another type"),
+        (with_other(lambda record: record["identity"].pop("cell")), "is damaged: its identity.cell is missing, or of"),
+        (with_other(lambda record: record["test"]["tests"].update(own=[])), "is damaged: its test.tests is missing, or of"),
+        (
+            with_other(lambda record: record["test"]["tests"]["own"]["mean"].update(collisions="many")),
+            "its test.tests.own.mean is",
+        ),
+        (with_other(lambda record: record["curve"]["eval"]["cover_rate"].pop()), "its curve eval has not one value of every"),
+    ):
         path.write_text(text)
         with pytest.raises(ValueError, match=sentence):
             is_there(path, {})
+
+
+def copied(made, folder):
+    """The runs and records of the fixture again, the first with no record, its run to be found at a place of its own."""
+    shutil.copytree(made, folder, dirs_exist_ok=True)
+    first = wanted(folder)[0]
+    first.path.unlink()
+    return first
+
+
+def test_a_lost_record_is_put_back_from_its_run(made, tmp_path, monkeypatch):
+    first = copied(made, tmp_path)
+    monkeypatch.setattr(reproduce_run.sweep_run, "main", None)  # cannot be called
+    assert reproduce.main(command(tmp_path, "--dry-run")) == 0
+    assert reproduce_run.main([str(first.begin(keep_runs=False))]) == 0
+    assert first.path.read_bytes() == wanted(made)[0].path.read_bytes()
+
+
+def test_a_run_that_cannot_leave_the_record_any_more_is_refused_before_anything_is_begun(made, tmp_path, capsys):
+    first = copied(made, tmp_path)
+    folder = first.run.place.run().folder
+    for path in [*reproduce.records_folder(tmp_path / "docs").rglob("seed_*.json")]:
+        path.unlink()
+    assert reproduce.main(command(tmp_path, "--dry-run", "--test-episodes", "30")) == 2
+    told = f"the run {folder.path} was measured with test_episodes 40, and is now to have 30; choose another scale, or other "
+    assert told in capsys.readouterr().err
+    (folder.path / "record.json").unlink()
+    assert reproduce.main(command(tmp_path, "--dry-run")) == 2
+    assert capsys.readouterr().err == (
+        f"error: the run {folder.path} has ended, and its record is gone, as is 0.monitor.csv; "
+        "remove this folder, too, to measure anew\n"
+    )
+    folder.monitor_file.write_text("")  # as if it had been killed before its record was written
+    assert reproduce.main(command(tmp_path, "--dry-run", "--test-episodes", "30")) == 2
+    assert told in capsys.readouterr().err
+    assert not first.path.exists()
+
+
+def test_a_run_does_not_go_on_with_another_test(tmp_path):
+    measure = reproduce_run.Measure(None, {"own": {}}, 3, tmp_path / "measured.json")
+    then = {"of": {"tests": {"own": {}}, "test_episodes": 2}, "taken": measure.taken()}
+    measure.set_state({**then, "test": None})  # was not played yet
+    with pytest.raises(
+        ValueError, match=r"this run was measured with test_episodes 2, and is now to have 3; .* remove its folder"
+    ):
+        measure.set_state({**then, "test": {"after": 190}})
+
+
+def test_a_training_that_is_too_short_for_an_episode_has_none_in_its_curve(tmp_path):
+    write(tmp_path)
+    own = wanted(tmp_path, scale=0.02)[0]  # 8 env steps in 2 worlds, and an episode takes 5
+    assert reproduce_run.main([str(own.begin(keep_runs=False))]) == 0
+    curve = read_record(own.path)["curve"]["eval"]
+    assert set(curve["episodes"]) == {0.0} and len(curve["cover_rate"]) == len(curve["steps"])
+
+
+def test_scripted_records_of_other_tests_lie_apart_and_are_checked_before_anything_is_begun(made, tmp_path, capsys):
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    path = reproduce.records_folder(tmp_path / "docs") / "spread" / "scripted" / "40_episodes" / "random.json"
+    record = json.loads(path.read_text())
+    record["identity"]["test_episodes"] = 50
+    path.write_text(json.dumps(record))
+    assert reproduce.main(command(tmp_path, "--dry-run")) == 2
+    assert f"the record {path} was measured with test_episodes 50, and is now to have 40" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -248,6 +344,7 @@ def test_a_damaged_record_is_told(made, tmp_path):
         (["table2", "--test-episodes", "1"], "--test-episodes must be a whole number of at least 2, got 1"),
         (["table2", "--cells", "madpg"], "there is no cell madpg among these; there are kfcv_maddpg, maddpg"),
         (["table2", "--report"], "--report writes the whole page, of all records; leave out table2"),
+        (["--report", "--seeds", "2", "--dry-run"], "--report writes the whole page, of all records; leave out"),
         (["table2", "--local", "--address", "auto"], "--local goes without Ray, and --address names a Ray cluster"),
     ],
 )
@@ -275,6 +372,39 @@ def test_bad_words(tmp_path, capsys, words, sentence):
             {"pictures": {"a": [{"title": "a"}]}},
             "spread: a panel needs a title and one of curve, scatter, estimates, rivals, not",
         ),
+        ({"pictures": {"a": [{"curve": "curve/eval/cover_rate"}]}}, "spread: a panel needs a title and one of curve, "),
+        ({"pictures": {"a": [{"titel": "a"}]}}, 'unknown key of a panel of spread "titel"; did you mean "title"?'),
+        ({"pictures": {"a": [{"title": "a", "rivals": "test/own/x"}]}}, "is a rivals of test/own/x; it must be of curve/…"),
+        (
+            {"pictures": {"a": [{"title": "a", "scatter": "test/own/collisions"}]}},
+            "spread: a: of single episodes tests keep return_agent, not test/own/collisions",
+        ),
+        (
+            {"pictures": {"a": [{"title": "a", "curve": "curve/evel/cover_rate"}]}},
+            'spread: unknown evaluation of maddpg "evel"; did you mean "eval"?',
+        ),
+        ({"pictures": {"Fig 6": []}}, 'a picture is called "Fig 6"; give it a name of a-z, 0-9, _ and -'),
+        ({"tests": {"alone": {"agnt": "random"}}}, 'spread: unknown group "agnt"; did you mean "agent"?'),
+        (
+            {"scripted": [{"agent": "greedy-nearst"}]},
+            'spread: unknown scripted policy of \'agent\' "greedy-nearst"; did you mean "greedy-nearest"?',
+        ),
+        ({"columns": {"x": 3}}, 'spread: the column "x" is 3; it must be a quantity, or have weights of some'),
+        (
+            {"columns": {"x": {"weights": {"test/own/length": 1}, "pluss": 2}}},
+            'unknown key of the column "x" of spread "pluss"; did you mean "plus"?',
+        ),
+        (
+            {"columns": {"x": {"weights": {"test/own/length": "much"}}}},
+            "key of the column \"x\" of spread weights is {'test/own/length': 'much'}; it must be a map",
+        ),
+        ({"better": {"colisions": "lower"}}, 'unknown column of spread "colisions"; did you mean "collisions"?'),
+        ({"better": {"collisions": "less"}}, 'spread: better: collisions is "less"; it must be lower or higher'),
+        ({"published": {"maddpg": {"returns": 1}}}, 'unknown column of spread "returns"; did you mean "return"?'),
+        (
+            {"sweeps": [{"algos": ["maddpg"], "envs": ["HardSpread-v0", "Grassland-v0"]}], "published": {}, "scripted": []},
+            "spread: a sweep has the worlds HardSpread-v0 and Grassland-v0; give each",
+        ),
         ({"effects": {"default": "maddpg"}}, "spread: effects needs default and quantity, not"),
         (
             {"sweeps": [{"algos": ["maddpg"], "envs": ["HardSpread-v0"], "seeds": 3}], "published": {}},
@@ -300,6 +430,7 @@ def test_bad_claims(tmp_path):
         ({"higher": "maddpg"}, "a claim needs says, experiment, quantity, than, and one of higher and lower, not"),
         ({"experiment": "spred"}, 'unknown experiment "spred"; did you mean "spread"?'),
         ({"lower": "kfcv"}, 'unknown cell of spread "kfcv"; did you mean "kfcv_maddpg"?'),
+        ({"from": 1.0}, r"from of a claim is 1; it must be at least 0 and below 1 \(fewer collisions\)"),
     ):
         with pytest.raises(ValueError, match=sentence.replace("?", r"\?")):
             read_experiments(write(tmp_path, {**TINY, "claims": [{**good, **changes}]}))
@@ -330,7 +461,7 @@ def test_the_papers_experiments_are_what_the_paper_says(tmp_path):
     assert len(set(names)) == len(names)
     pytest.importorskip("mpe2")
     for name, own in experiments.items():
-        reproduce.check_metrics(own, [claim.quantity for claim in claims if claim.experiment == name])
+        reproduce.check_worlds(own, all_of_them[name], [claim for claim in claims if claim.experiment == name])
 
 
 def test_the_page_has_a_place_for_everything():
@@ -343,21 +474,19 @@ def test_the_page_has_a_place_for_everything():
 # ---- what records say
 
 
-def record(cell, seed, mean=0.0, curve=(0.0,), algo="maddpg"):
+def record(cell, seed, mean=0.0, curve=(0.0,), algo="maddpg", scale=1.0):
     """A record by hand: `x` of its test, and of the evaluations after 10, 20, … env steps."""
     steps = [10 * (i + 1) for i in range(len(curve))]
-    settings = {"n_timesteps": 10 * len(curve)}
+    about = {"experiment": "e", "cell": cell, "scale": scale, "seed": seed, "algo": algo, "env": "W"}
+    test = {"tests": {"own": {}}, "test_episodes": 2}
     return {
-        "identity": {
-            "experiment": "e",
-            "cell": cell,
-            "scale": 1.0,
-            "seed": seed,
-            "algo": algo,
-            "env": "W",
-            "settings": settings,
-        },
-        "test": {"tests": {"own": {"mean": {"x": mean}}}},
+        "identity": {**about, **test, "settings": {"n_timesteps": 10 * len(curve)}},
+        "command": "",
+        "date": "2022-12-06",
+        "machine": {"processor": "P", "cores": 2},
+        "versions": {"torch": "2"},
+        "taken": {"wall": 1.0, "processor": 1.0, "memory": 1e6},
+        "test": {"seeds": [7, 8], "tests": {"own": {"mean": {"x": mean}, "returns": {}}}},
         "curve": {"eval": {"steps": steps, "episodes": steps, "x": list(curve)}},
     }
 
@@ -445,12 +574,84 @@ def test_a_difference_has_an_interval_of_both_sides_draws():
     assert wide.mean == -1.0 and wide.low < -2 and wide.high > 0
 
 
+ONE = Experiment("e", "E", [{"algos": ["maddpg"], "envs": ["W"]}], scripted=[{"agent": "random"}])
+
+
+def written(folder, given, path=None):
+    """A record, where it belongs or elsewhere."""
+    identity = given["identity"]
+    if path is None:
+        path = ONE.records(folder, identity["scale"]) / identity["cell"] / f"seed_{identity['seed']}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(given))
+    return path
+
+
 def test_records_of_different_scales_never_mix(tmp_path):
-    experiment = Experiment("e", "E", [{"algos": ["maddpg"], "envs": ["W"]}])
     for scale, means in ((0.1, [1.0, 2.0, 3.0]), (0.5, [7.0])):
         for seed, mean in enumerate(means):
-            path = experiment.records(tmp_path, scale) / "maddpg" / f"seed_{seed}.json"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps(record("maddpg", seed, mean)))
-    told = reproduce_report.read_results(experiment, tmp_path)
+            written(tmp_path, record("maddpg", seed, mean, scale=scale))
+    told = reproduce_report.read_results(ONE, tmp_path)
     assert told.scale == 0.1 and told.values("maddpg", "test/own/x").tolist() == [1.0, 2.0, 3.0]  # of 0.5 there is one seed
+
+
+def test_records_that_differ_are_not_shown_together(tmp_path):
+    written(tmp_path, record("maddpg", 0))
+    other = record("maddpg", 1)
+    other["identity"]["settings"]["gamma"] = 0.5
+    path = written(tmp_path, other)
+    with pytest.raises(ValueError, match=f"the record {path} was measured with settings.gamma 0.5, and seed_0.json beside"):
+        reproduce_report.read_results(ONE, tmp_path)
+    path = written(tmp_path, record("maddpg", 2), path)
+    with pytest.raises(ValueError, match=f"the record {path} is of the seed 2; its path says 1"):
+        reproduce_report.read_results(ONE, tmp_path)
+    other = record("maddpg", 1)
+    other["test"]["seeds"] = [9, 10]
+    written(tmp_path, other, path)
+    with pytest.raises(
+        ValueError, match=rf"the record {path} is of a test with the seeds 9 to 10, and .*seed_0.json of 7 to 8"
+    ):
+        reproduce_report.read_results(ONE, tmp_path)
+
+
+def test_scripted_policies_are_shown_that_met_the_same_episodes(tmp_path):
+    written(tmp_path, record("maddpg", 0))
+    scripted = record("maddpg", 0, mean=5.0)
+    scripted["identity"] = {"experiment": "e", "players": {"agent": "random"}, "test_episodes": 2}
+    written(tmp_path, scripted, ONE.scripted_record(tmp_path, {"agent": "random"}, 3))
+    assert reproduce_report.read_results(ONE, tmp_path).scripted == {}
+    path = written(tmp_path, scripted, ONE.scripted_record(tmp_path, {"agent": "random"}, 2))
+    assert [*reproduce_report.read_results(ONE, tmp_path).scripted] == ["random"]
+    scripted["test"]["seeds"] = [8, 9]
+    written(tmp_path, scripted, path)
+    with pytest.raises(ValueError, match=f"the record {path} is of a test with the seeds 8 to 9, and"):
+        reproduce_report.read_results(ONE, tmp_path)
+
+
+def test_cells_that_the_experiment_has_no_more_are_left_out(tmp_path, capsys):
+    written(tmp_path, record("maddpg", 0, scale=0.1))
+    for seed in range(5):
+        written(tmp_path, record("gone/maddpg", seed, scale=0.5))
+    told = reproduce_report.read_results(ONE, tmp_path)
+    assert told.scale == 0.1 and [*told.cells] == ["maddpg"]
+    assert capsys.readouterr().err.startswith("note: e has no cell gone/maddpg; ")
+
+
+def test_what_is_no_number_is_told_and_left_out_of_nothing(tmp_path):
+    for seed in range(5):
+        mean, late = (None, None) if seed == 4 else (1.0, 1.0)
+        written(tmp_path, record("maddpg", seed, mean, curve=(1.0, late)))
+    experiment = Experiment(
+        "e", "E", ONE.sweeps, columns={"x": "test/own/x"}, pictures={"p": [{"title": "", "curve": "curve/eval/x"}]}
+    )
+    told = reproduce_report.read_results(experiment, tmp_path)
+    assert f"| MADDPG | {NOT_A_NUMBER} | 5 |" in reproduce_report.results_table(told)
+    claim = Claim("", "e", "test/own/x", lower=True, cell="maddpg", than=9.0)
+    assert (judged(claim, told).word, judged(claim, told).numbers) == (CANNOT_BE_TOLD, NOT_A_NUMBER)
+    _, values = reproduce_report.curves(told.cells["maddpg"], "curve/eval/x")
+    assert [own.mean for own in reproduce_report.iqm_curve_of(values)] == [1.0, pytest.approx(np.nan, nan_ok=True)]
+    effects = Experiment("e", "E", ONE.sweeps, effects={"default": "a", "quantity": "test/own/x"})
+    cells = {"a": told.cells["maddpg"][:4], "b": told.cells["maddpg"]}
+    (line,) = reproduce_report.effects_table(Results(effects, 1.0, cells, {})).splitlines()[3:]
+    assert line.split(" | ")[1:5] == [NOT_A_NUMBER, NOT_A_NUMBER, "", CANNOT_BE_TOLD]
+    assert reproduce_report.draw_pictures(told, tmp_path)

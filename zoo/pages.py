@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
-PLACE = re.compile(r"(<!-- table: ([a-z0-9_-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+NAME = r"[a-z0-9_-]+"  # of a table
+PLACE = re.compile(rf"(<!-- table: ({NAME}) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def filled(page: str, table: Callable[[str], str]) -> str:

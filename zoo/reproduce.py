@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,24 +21,28 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # scripts import e
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.matches import Arena
+from sb3_kfcv.saving.checkpoints import checkpoints_in
 from zoo.command_line import REFUSALS, SEVERAL, Parser, as_it_was_typed, refused, start, whole_number
+from zoo.hyperparams import CO_TRAINING
 from zoo.reproduce_plan import (
     EXPERIMENTS,
+    OWN,
     Claim,
     Experiment,
     LineUp,
     PlannedRecord,
     chosen,
-    is_there,
     planned,
     read_experiments,
-    read_record,
 )
-from zoo.reproduce_report import write_report
+from zoo.reproduce_records import is_there, read_record, record_in_the_run
+from zoo.reproduce_report import n_runs, write_report
 from zoo.reproduce_run import facts, played, write_record
 from zoo.run_groups import REWARD
+from zoo.runs import Run
 from zoo.sweep import add_workers, check_runs, check_workers, locked, sweep
 from zoo.sweep_table import duration
+from zoo.teams import yardsticks
 from zoo.workers import Task, make_workers, n_cores
 from zoo.worlds import World
 
@@ -89,18 +94,14 @@ def build(args: argparse.Namespace) -> tuple[dict[str, Experiment], list[Claim],
         raise ValueError(f"--scale is {args.scale}; it must be above 0 and at most 1")
     experiments, claims = read_experiments(args.conf_file)
     if args.report:
-        if args.targets:
-            raise ValueError(f"--report writes the whole page, of all records; leave out {' '.join(args.targets)}")
+        check_report(args)
         return experiments, claims, []
     folders = Path(args.log_folder), records_folder(args.docs)
-    these = chosen(experiments, args.targets)
-    for experiment in these:
-        check_metrics(experiment, [claim.quantity for claim in claims if claim.experiment == experiment.name])
-    wanted = [
-        record
-        for experiment in these
-        for record in planned(experiment, args.scale, *folders, args.seeds, args.test_episodes, args.threads)
-    ]
+    wanted = []
+    for experiment in chosen(experiments, args.targets):
+        own = planned(experiment, args.scale, *folders, args.seeds, args.test_episodes, args.threads)
+        check_worlds(experiment, own, [claim for claim in claims if claim.experiment == experiment.name])
+        wanted += own
     cells = {record.cell for record in wanted}
     for cell in args.cells:
         if cell not in cells:
@@ -109,78 +110,203 @@ def build(args: argparse.Namespace) -> tuple[dict[str, Experiment], list[Claim],
     return experiments, claims, sorted(wanted, key=lambda record: record.run.seed)
 
 
-def check_metrics(experiment: Experiment, further: Sequence[str]) -> None:
+def check_report(args: argparse.Namespace) -> None:
     """
-    :param experiment: whose quantities are to be measured
+    :param args: the command line, with ``--report``
+    :raises ValueError: for words that it has no use for
+    """
+    parser = make_parser()
+    unused = [
+        action.option_strings[-1]
+        for action in parser._actions
+        if action.option_strings
+        and action.dest not in ("help", "report", "docs", "conf_file")
+        and getattr(args, action.dest) != action.default
+    ]
+    if args.targets or unused:
+        raise ValueError(f"--report writes the whole page, of all records; leave out {' '.join([*args.targets, *unused])}")
+
+
+def check_worlds(experiment: Experiment, wanted: Sequence[PlannedRecord], claims: Sequence[Claim]) -> None:
+    """
+    :param experiment: the experiment
+    :param wanted: its runs
+    :param claims: about it
+    :raises ValueError: for a metric, a group, a policy or an evaluation that a world or a run of it does not have
+    """
+    arenas = {env_id: Arena(World(env_id).make(1)) for env_id in sorted(experiment.env_ids)}
+    try:
+        for arena in arenas.values():
+            _check_names(experiment, arena, [claim.quantity for claim in claims])
+        for record in {record.cell: record for record in wanted}.values():
+            _check_evaluations(record, arenas[record.run.env_id], claims)
+    except ValueError as error:
+        raise ValueError(f"{experiment.name}: {error}") from None
+    finally:
+        for arena in arenas.values():
+            arena.env.close()
+
+
+def _check_names(experiment: Experiment, arena: Arena, further: Sequence[str]) -> None:
+    """
+    :param experiment: the experiment
+    :param arena: its world
     :param further: quantities beside its own
-    :raises ValueError: for a metric that a world of it does not have, with the nearest one
+    :raises ValueError: see :func:`check_worlds`
     """
-    for env_id in sorted(experiment.env_ids):
-        arena = Arena(World(env_id).make(1))
-        known = {REWARD, *arena.quantities()}
-        arena.env.close()
-        for of in [*experiment.quantities, *further]:
-            metric = of.split("/", 2)[2]
-            if metric not in known:
-                raise ValueError(f"{experiment.name}: {unknown_name('metric', metric, known)}")
+    groups = arena.layout.group_names
+    for line_up in [*experiment.tests.values(), *experiment.scripted]:
+        for group, player in line_up.items():
+            if group not in groups:
+                raise ValueError(unknown_name("group", group, groups))
+            arena.side(group, player)  # refuses who cannot play
+    for line_up in experiment.scripted:
+        if set(line_up) != set(groups):
+            raise ValueError(f"scripted names {', '.join(line_up) or 'nobody'}; to be played are {', '.join(groups)}")
+    known = {REWARD, *arena.quantities()}
+    for of in [*experiment.quantities, *further]:
+        metric = of.split("/", 2)[2]
+        if metric not in known:
+            raise ValueError(unknown_name("metric", metric, known))
+    kept = f"return_{groups[0]}"
+    for panel in [panel for panels in experiment.pictures.values() for panel in panels if "scatter" in panel]:
+        if panel["scatter"].split("/", 2)[2] != kept:
+            raise ValueError(f"{panel['title']}: of single episodes tests keep {kept}, not {panel['scatter']}")
 
 
-def play_scripted(experiments: Sequence[Experiment], records: Path, n_test_episodes: int | None) -> None:
+def _check_evaluations(record: PlannedRecord, arena: Arena, claims: Sequence[Claim]) -> None:
     """
-    Measure the scripted policies that experiments are read beside, each once.
+    :param record: of any seed of a cell
+    :param arena: its world
+    :param claims: about the experiment
+    :raises ValueError: see :func:`check_worlds`
+    """
+    run, cell = record.run, record.cell
+    team = run.hyperparams.model.get("team")
+    learners = list(run.hyperparams.model.get("teams", [team] if team else []))
+    found = yardsticks(run.args.yardstick, arena.layout, learners, run.algo == CO_TRAINING)
+    known = ["eval", *(yardstick.name for yardstick in found)]
+    claimed = [claim.quantity for claim in claims if cell in (claim.cell, claim.than)]
+    for of in [*record.experiment.quantities_of(cell), *claimed]:
+        kind, name, _ = of.split("/", 2)
+        if kind == "curve" and name not in known:
+            raise ValueError(unknown_name(f"evaluation of {cell}", name, known))
 
-    :param experiments: whose
+
+def check_records(missing: Sequence[PlannedRecord]) -> None:
+    """
+    :param missing: runs that have no record
+    :raises ValueError: for a run that has ended and cannot leave its record any more, and for a record that one of these could
+        not be shown with
+    """
+    for record in missing:
+        record_in_the_run(record.run.place, record.identity)
+    for folder, record in {record.path.parent: record for record in missing}.items():
+        for path in sorted(folder.glob("seed_*.json")):
+            is_there(path, {**record.identity, "seed": read_record(path)["identity"]["seed"]})
+
+
+@dataclass(frozen=True)
+class Scripted:
+    """
+    Scripted policies that an experiment is read beside.
+
+    :param experiment: the experiment
+    :param line_up: who plays every group
+    :param n_episodes: of the test
+    :param path: of the record
+    """
+
+    experiment: Experiment
+    line_up: LineUp
+    n_episodes: int
+    path: Path
+
+    @property
+    def identity(self) -> dict[str, object]:
+        """What the record is of."""
+        return {"experiment": self.experiment.name, "players": self.line_up, "test_episodes": self.n_episodes}
+
+
+def scripted_beside(wanted: Sequence[PlannedRecord], records: Path) -> list[Scripted]:
+    """
+    The scripted policies that runs are read beside and that have no record yet, each once.
+
+    :param wanted: the runs
     :param records: folder of all records
-    :param n_test_episodes: by default those of the experiment
+    :raises ValueError: for a record of something else, or a damaged one
     """
-    for experiment in experiments:
-        for line_up in experiment.scripted:
-            n_episodes = n_test_episodes or experiment.test_episodes
-            identity = scripted_identity(experiment, line_up, n_episodes)
-            path = experiment.scripted_record(records, line_up)
-            if not is_there(path, identity):
-                print(f"{experiment.name}: {', '.join(line_up.values())} …", flush=True)
-                (env_id,) = experiment.env_ids
-                test = played(World(env_id), {"own": line_up}, n_episodes)
-                write_record(path, {"identity": identity, **facts(), "test": test})
+    found = {}
+    for record in wanted:
+        for line_up in record.experiment.scripted:
+            path = record.experiment.scripted_record(records, line_up, record.n_test_episodes)
+            found[path] = Scripted(record.experiment, line_up, record.n_test_episodes, path)
+    return [own for own in found.values() if not is_there(own.path, own.identity)]
 
 
-def scripted_identity(experiment: Experiment, line_up: LineUp, n_episodes: int) -> dict[str, object]:
-    """What the record of scripted policies is of."""
-    return {"experiment": experiment.name, "players": line_up, "test_episodes": n_episodes}
+def play_scripted(scripted: Sequence[Scripted]) -> None:
+    """
+    Measure scripted policies.
+
+    :param scripted: those that have no record
+    """
+    for own in scripted:
+        print(f"{own.experiment.name}: {', '.join(own.line_up.values())} …", flush=True)
+        (env_id,) = own.experiment.env_ids
+        test = played(World(env_id), {OWN: own.line_up}, own.n_episodes)
+        write_record(own.path, {"identity": own.identity, **facts(), "test": test})
 
 
-def seconds_of(record: PlannedRecord, wanted: Sequence[PlannedRecord]) -> float | None:
-    """How long a run will take, by those of its cell that have ended."""
-    ended = [own.path for own in wanted if (own.path.parent == record.path.parent) and own.path.is_file()]
-    return float(np.mean([read_record(path)["taken"]["wall"] for path in ended])) if ended else None
+def seconds_per_step(records: Path, record: PlannedRecord) -> float | None:
+    """
+    How long an env step of a cell takes, by the runs of it that have ended, of any scale.
+
+    :param records: folder of all records
+    :param record: of the cell
+    :return: ``None`` if there is none
+    """
+    ended = [read_record(path) for path in (records / record.experiment.name).glob(f"scale_*/{record.cell}/seed_*.json")]
+    speeds = [own["taken"]["wall"] / own["identity"]["settings"]["n_timesteps"] for own in ended]
+    return float(np.mean(speeds)) if speeds else None
 
 
-def list_records(wanted: Sequence[PlannedRecord], n_workers: int) -> None:
+def list_records(wanted: Sequence[PlannedRecord], records: Path, n_workers: int) -> None:
     """
     Print what is to be done.
 
     :param wanted: everything
+    :param records: folder of all records
     :param n_workers: so many at a time
     """
     counts = {"begin": 0, "go on": 0, "done": 0}
     total, unknown = 0.0, 0
+    speeds: dict[Path, float | None] = {}
     for record in wanted:
-        todo = "done" if record.path.is_file() else "begin" if record.run.place.run() is None else "go on"
+        run = record.run.place.run()
+        todo = "done" if record.path.is_file() else "begin" if run is None else "go on"
         counts[todo] += 1
-        line = f"{todo:5}  {record.experiment.name} {record.cell} seed {record.run.seed}"
-        line += f", {record.run.hyperparams.n_timesteps:,} env steps"
-        seconds = seconds_of(record, wanted) if todo != "done" else None
-        if seconds is not None:
-            total += seconds
-            line += f", about {duration(seconds)}"
-        elif todo != "done":
-            unknown += 1
+        n_timesteps = record.run.hyperparams.n_timesteps
+        line = f"{todo:5}  {record.experiment.name} {record.cell} seed {record.run.seed}, {n_timesteps:,} env steps"
+        if todo != "done":
+            if record.path.parent not in speeds:
+                speeds[record.path.parent] = seconds_per_step(records, record)
+            speed = speeds[record.path.parent]
+            if speed is None:
+                unknown += 1
+            else:
+                seconds = speed * (n_timesteps - (0 if run is None else steps_of(run, n_timesteps)))
+                total += seconds
+                line += f", about {duration(seconds)}"
         print(line)
-    print(f"{len(wanted)} runs: {counts['begin']} to begin, {counts['go on']} to go on with, {counts['done']} done")
+    print(f"{n_runs(len(wanted))}: {counts['begin']} to begin, {counts['go on']} to go on with, {counts['done']} done")
     if total:
-        rest = f", and {unknown} runs of which nothing is known yet" if unknown else ""
+        rest = f", and {n_runs(unknown)} of which nothing is known yet" if unknown else ""
         print(f"about {duration(total / n_workers)} with {n_workers} at a time{rest}")
+
+
+def steps_of(run: Run, n_timesteps: int) -> int:
+    """The env steps that a run of so many need not do again."""
+    return n_timesteps if run.has_ended else min(n_timesteps, max(checkpoints_in(run.folder.path), default=0))
 
 
 def task_of(record: PlannedRecord, keep_runs: bool) -> Task:
@@ -202,8 +328,7 @@ def reproduce(args: argparse.Namespace, wanted: Sequence[PlannedRecord], again: 
     missing = [record for record in wanted if not record.path.is_file()]
     folder = Path(args.log_folder)
     with locked(folder):
-        experiments = {record.experiment.name: record.experiment for record in wanted}
-        play_scripted([*experiments.values()], records_folder(args.docs), args.test_episodes)
+        play_scripted(scripted_beside(wanted, records_folder(args.docs)))
         if not missing:
             return 0
         tasks = [task_of(record, args.keep_runs) for record in missing]
@@ -221,13 +346,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = make_parser().parse_all(argv)
         experiments, claims, wanted = build(args)
+        records = records_folder(args.docs)
         missing = [record for record in wanted if not is_there(record.path, record.identity)]
+        check_records(missing)
+        scripted_beside(wanted, records)  # refuses records of something else
         check_runs([record.run for record in missing])
         if args.dry_run:
-            list_records(wanted, args.workers or max(1, n_cores() // args.threads))
+            list_records(wanted, records, args.workers or max(1, n_cores() // args.threads))
             return 0
         status = reproduce(args, wanted, as_it_was_typed("reproduce", argv)) if wanted else 0
-        for path in write_report(experiments, claims, Path(args.docs), records_folder(args.docs)):
+        for path in write_report(experiments, claims, Path(args.docs), records):
             print(f"written: {path}")
         return status
     except REFUSALS as error:

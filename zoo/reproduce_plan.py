@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,9 @@ from typing import Any
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.naming import unknown_name
 from zoo.hyperparams import CO_TRAINING, HYPERPARAMS
+from zoo.pages import NAME
 from zoo.run_folder import read_map
-from zoo.sweep_plan import PlannedRun, in_one_line, plan
+from zoo.sweep_plan import KEYS, PlannedRun, in_one_line, plan
 from zoo.train import make_parser
 from zoo.typed_settings import checked
 
@@ -47,6 +49,8 @@ EXPERIMENT_KEYS = {
     "effects": dict[str, str],
     "pictures": dict[str, list[dict[str, Any]]],
 }
+SIDES = ("lower", "higher")
+TABLES = ("claims", "runs")  # of the page, beside those of the experiments
 PANELS = ("curve", "scatter", "estimates", "rivals")
 CLAIM_KEYS = {
     "says": str,
@@ -95,8 +99,13 @@ class Experiment:
     @property
     def quantities(self) -> list[str]:
         """Every quantity that its table and its pictures show."""
-        weighed = [[of] if isinstance(of, str) else [*of.get("weights", {})] for of in self.columns.values()]
-        drawn = [panel[kind] for panels in self.pictures.values() for panel in panels for kind in PANELS if kind in panel]
+        return list(dict.fromkeys(of for cell in [None, *self.cells] for of in self.quantities_of(cell)))
+
+    def quantities_of(self, cell: str | None) -> list[str]:
+        """Every quantity of a cell that its table and its pictures show; of ``None`` those of all cells."""
+        weighed = [[of] if isinstance(of, str) else [*of["weights"]] for of in self.columns.values()]
+        panels = [panel for own in self.pictures.values() for panel in own if "cells" not in panel or cell in panel["cells"]]
+        drawn = [panel[kind] for panel in panels for kind in PANELS if kind in panel]
         effects = [self.effects["quantity"]] if self.effects else []
         return [*(name for names in weighed for name in names), *drawn, *effects]
 
@@ -114,9 +123,9 @@ class Experiment:
         """Where its records lie, apart from those of other scales."""
         return folder / self.name / f"scale_{scale:g}"
 
-    def scripted_record(self, folder: Path, line_up: LineUp) -> Path:
-        """Where it is kept what scripted policies reach."""
-        return folder / self.name / "scripted" / f"{'_'.join(line_up.values())}.json"
+    def scripted_record(self, folder: Path, line_up: LineUp, n_episodes: int) -> Path:
+        """Where it is kept what scripted policies reach, apart by the length of the test."""
+        return folder / self.name / "scripted" / f"{n_episodes}_episodes" / f"{'_'.join(line_up.values())}.json"
 
 
 @dataclass(frozen=True)
@@ -214,15 +223,28 @@ def _experiment(name: str, given: Mapping[str, Any]) -> Experiment:
     for key in ("title", "sweeps"):
         if not own.get(key):
             raise ValueError(f"the experiment {name} lacks {key}")
+    for what, called in (("an experiment", name), *(("a picture", picture) for picture in own.get("pictures", {}))):
+        if not re.fullmatch(NAME, called) or called in (ALL, *TABLES):
+            raise ValueError(
+                f'{what} is called "{called}"; give it a name of a-z, 0-9, _ and -, other than {ALL}, {_listed(TABLES)}'
+            )
+    own["columns"] = {heading: _column(name, heading, of) for heading, of in own.get("columns", {}).items()}
+    own["sweeps"] = [checked(f"key of a sweep of {name}", sweep, KEYS) for sweep in own["sweeps"]]
     experiment = Experiment(name, **own)
     require_count(f"{name}: seeds", experiment.seeds)
     require_count(f"{name}: test_episodes", experiment.test_episodes, least=2)
+    for sweep in experiment.sweeps:
+        worlds = sweep.get("envs", ())
+        if len(worlds) > 1:
+            raise ValueError(
+                f"{name}: a sweep has the worlds {_listed(worlds)}; give each a sweep or an experiment of its own"
+            )
     if experiment.scripted and len(experiment.env_ids) != 1:
         raise ValueError(f"the experiment {name} has scripted policies and {len(experiment.env_ids)} worlds; it must have one")
+    _check_columns(experiment)
     panels = [panel for panels in experiment.pictures.values() for panel in panels]
     for panel in panels:
-        if len(panel.keys() & {*PANELS}) != 1 or not panel.keys() <= {*PANELS, "title", "cells"}:
-            raise ValueError(f"{name}: a panel needs a title and one of {', '.join(PANELS)}, not {in_one_line(panel)}")
+        _check_panel(name, panel)
     if experiment.effects and experiment.effects.keys() != {"default", "quantity"}:
         raise ValueError(f"{name}: effects needs default and quantity, not {in_one_line(experiment.effects)}")
     default = [experiment.effects["default"]] if experiment.effects else []
@@ -231,6 +253,52 @@ def _experiment(name: str, given: Mapping[str, Any]) -> Experiment:
     for of in experiment.quantities:
         require_quantity(experiment, of)
     return experiment
+
+
+def _listed(names: Sequence[Any]) -> str:
+    return " and ".join(map(str, names))
+
+
+def _column(name: str, heading: str, of: Any) -> Any:
+    """
+    A column of a table, its numbers as numbers.
+
+    :raises ValueError: if it is neither a quantity nor weights of some
+    """
+    if isinstance(of, str):
+        return of
+    if not isinstance(of, dict) or not of.get("weights"):
+        raise ValueError(
+            f'{name}: the column "{heading}" is {in_one_line(of)}; it must be a quantity, or have weights of some'
+        )
+    return checked(f'key of the column "{heading}" of {name}', of, {"weights": dict[str, float], "plus": float})
+
+
+def _check_columns(experiment: Experiment) -> None:
+    """
+    :raises ValueError: if something is said of a column that there is not, or what cannot be said
+    """
+    said = [*experiment.better, *(column for own in experiment.published.values() for column in own)]
+    for column in said:
+        if column not in experiment.columns:
+            raise ValueError(unknown_name(f"column of {experiment.name}", column, experiment.columns))
+    for column, side in experiment.better.items():
+        if side not in SIDES:
+            raise ValueError(f'{experiment.name}: better: {column} is "{side}"; it must be {" or ".join(SIDES)}')
+
+
+def _check_panel(name: str, panel: Mapping[str, Any]) -> None:
+    """
+    :raises ValueError: for a panel that cannot be drawn, as far as the file tells
+    """
+    kinds = [kind for kind in PANELS if kind in panel]
+    own = checked(f"key of a panel of {name}", panel, {"title": str, "cells": list[str], **dict.fromkeys(PANELS, str)})
+    if len(kinds) != 1 or not own.get("title") or own.get("cells") == []:
+        raise ValueError(f"{name}: a panel needs a title and one of {', '.join(PANELS)}, not {in_one_line(panel)}")
+    (kind,) = kinds
+    for drawn, start in (("curve", "curve/"), ("rivals", "curve/"), ("scatter", "test/")):
+        if kind == drawn and not own[kind].startswith(start):
+            raise ValueError(f"{name}: the panel {own['title']} is a {kind} of {own[kind]}; it must be of {start}…")
 
 
 def require_cell(experiment: Experiment, cell: str) -> None:
@@ -262,6 +330,8 @@ def _claim(given: Mapping[str, Any], experiments: Mapping[str, Experiment]) -> C
         )
     if own["experiment"] not in experiments:
         raise ValueError(unknown_name("experiment", own["experiment"], experiments))
+    if not 0 <= own.get("from", 0.0) < 1:
+        raise ValueError(f"from of a claim is {own['from']:g}; it must be at least 0 and below 1 ({own['says']})")
     (direction,) = directions
     experiment = experiments[own["experiment"]]
     require_quantity(experiment, own["quantity"])
@@ -363,46 +433,3 @@ def _runs_of(sweep: Mapping[str, Any], scale: float, folder: Path, n_seeds: int,
     }
     train = {**own, **flags, "n-timesteps": n_timesteps}
     return plan({**sweep, "seeds": n_seeds, "train": train}, folder, threads)
-
-
-def read_record(path: Path) -> dict[str, Any]:
-    """
-    A record.
-
-    :raises ValueError: if it is damaged
-    """
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"the record {path} cannot be read: {error}") from None
-    if not isinstance(record, dict) or "identity" not in record:
-        raise ValueError(f"{path} is no record of zoo/reproduce.py")
-    return record
-
-
-def is_there(path: Path, identity: Mapping[str, Any]) -> bool:
-    """
-    Whether there is a record of just this.
-
-    :param path: where it would be
-    :param identity: what it is to be of
-    :raises ValueError: if it is of something else, with the first difference, or damaged
-    """
-    if not path.is_file():
-        return False
-    then = read_record(path)["identity"]
-    for name, ours, theirs in _differences(identity, then):
-        raise ValueError(
-            f"the record {path} was measured with {name} {in_one_line(theirs)}, and is now to have {in_one_line(ours)}; "
-            "choose another scale, or other settings by another name, or remove the record to measure anew"
-        )
-    return True
-
-
-def _differences(ours: Mapping[str, Any], theirs: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any, Any]]:
-    for name in {**ours, **theirs}:
-        one, other = ours.get(name), theirs.get(name)
-        if isinstance(one, dict) and isinstance(other, dict):
-            yield from _differences(one, other, f"{prefix}{name}.")
-        elif one != other:
-            yield f"{prefix}{name}", one, other

@@ -20,8 +20,10 @@ from zoo.hyperparams import CO_TRAINING
 from zoo.match_results import as_markdown, described, shown, write_text
 from zoo.pages import filled
 from zoo.plots import draw_estimates, draw_intervals, draw_legend, draw_references, line_styles, new_figure, save_figure
-from zoo.reproduce_plan import Claim, Experiment, read_record
-from zoo.run_groups import algo_label
+from zoo.reproduce_plan import Claim, Experiment
+from zoo.reproduce_records import Record, differences, read_record
+from zoo.run_groups import algo_label, note
+from zoo.runs import natural
 from zoo.statistics import (
     ENOUGH_RUNS,
     difference_with_interval,
@@ -30,13 +32,16 @@ from zoo.statistics import (
     iqm_with_interval,
     smallest_difference,
 )
+from zoo.sweep_plan import in_one_line
 
 PAGE = "reproduction.md"
 HOLDS, HOLDS_NOT, CANNOT_BE_TOLD = "holds", "does not hold", "cannot be told"
 
 SIDES = ("#D55E00", "#0072B2")  # of two teams, as everywhere
 
-Record = dict[str, Any]
+NOT_A_NUMBER = "not a number"
+NO_NUMBER = Interval(np.nan, np.nan, np.nan)
+
 Quantity = str | Mapping[str, Any]
 
 
@@ -68,25 +73,96 @@ class Results:
 
 def read_results(experiment: Experiment, folder: Path) -> Results:
     """
-    What there is of an experiment.
+    What there is of an experiment. Records of cells that it has no more are left out, which a note tells.
 
     :param experiment: the experiment
     :param folder: of all records
-    :raises ValueError: for a damaged record
+    :raises ValueError: for a damaged record, and for one that differs from those that it would be shown with
     """
-    scales = {float(path.name.removeprefix("scale_")): path for path in (folder / experiment.name).glob("scale_*")}
-    found = {scale: list(path.rglob("seed_*.json")) for scale, path in scales.items()}
-    scale = scale_shown(
-        {scale: list(Counter(own.parent for own in paths).values()) for scale, paths in found.items()}, len(experiment.cells)
-    )
-    records = sorted(map(read_record, found.get(scale, ())), key=lambda record: record["identity"]["seed"])
-    cells: dict[str, list[Record]] = {}
-    for record in records:
-        cells.setdefault(record["identity"]["cell"], []).append(record)
-    ordered = {cell: cells[cell] for cell in [*experiment.cells, *sorted(cells)] if cell in cells}
-    paths = {" against ".join(own.values()): experiment.scripted_record(folder, own) for own in experiment.scripted}
-    scripted = {label: read_record(path) for label, path in paths.items() if path.is_file()}
-    return Results(experiment, scale, ordered, scripted)
+    scales: dict[float, dict[str, list[Path]]] = {}
+    for place in sorted((folder / experiment.name).glob("scale_*")):
+        found: dict[str, list[Path]] = {}
+        for path in sorted(place.rglob("seed_*.json"), key=lambda path: natural(str(path))):
+            found.setdefault(path.parent.relative_to(place).as_posix(), []).append(path)
+        for cell in sorted(found.keys() - {*experiment.cells}):
+            note(f"{experiment.name} has no cell {cell}; {place / cell} is left out")
+        scales[_scale_of(place)] = {cell: found[cell] for cell in experiment.cells if cell in found}
+    scale = scale_shown({scale: [*map(len, cells.values())] for scale, cells in scales.items()}, len(experiment.cells))
+    paths = scales.get(scale, {})
+    cells = {cell: _read_cell(experiment, scale, cell, own) for cell, own in paths.items()}
+    return Results(experiment, scale, cells, _read_scripted(experiment, folder, cells, paths))
+
+
+def _scale_of(place: Path) -> float:
+    try:
+        return float(place.name.removeprefix("scale_"))
+    except ValueError:
+        raise ValueError(f"{place} holds no records: its name must be scale_ and a number") from None
+
+
+def _read_cell(experiment: Experiment, scale: float, cell: str, paths: Sequence[Path]) -> list[Record]:
+    """
+    The records of a cell, which differ by their seeds alone.
+
+    :param experiment: to which they belong
+    :param scale: by their paths
+    :param cell: by their paths
+    :param paths: by seed
+    :raises ValueError: for a record of something else
+    """
+    records = [read_record(path) for path in paths]
+    for path, record in zip(paths, records, strict=True):
+        place = {"experiment": experiment.name, "scale": scale, "cell": cell, "seed": path.stem.removeprefix("seed_")}
+        for name, told in place.items():
+            theirs = record["identity"][name]
+            if told not in (theirs, str(theirs)):
+                raise ValueError(f"the record {path} is of the {name} {theirs}; its path says {told}")
+        first = {**records[0]["identity"], "seed": record["identity"]["seed"]}
+        for name, ours, theirs in differences(first, record["identity"]):
+            raise ValueError(
+                f"the record {path} was measured with {name} {in_one_line(theirs)}, and {paths[0].name} beside it with "
+                f"{in_one_line(ours)}; remove the one that is not wanted"
+            )
+        for of in experiment.quantities_of(cell):
+            try:
+                quantity(record, of)
+            except ValueError:
+                raise ValueError(f"the record {path} has no {of}") from None
+    return records
+
+
+def _read_scripted(
+    experiment: Experiment, folder: Path, cells: Mapping[str, Sequence[Record]], paths: Mapping[str, Sequence[Path]]
+) -> dict[str, Record]:
+    """
+    The records of scripted policies on the episodes on which all runs were tested.
+
+    :param experiment: the experiment
+    :param folder: of all records
+    :param cells: what is shown
+    :param paths: where it lies
+    :return: who plays every group → record
+    :raises ValueError: if not all were tested on the same episodes
+    """
+    tested = [(path, record) for cell, own in cells.items() for path, record in zip(paths[cell], own, strict=True)]
+    if not tested:
+        return {}
+    n_episodes = tested[0][1]["identity"]["test_episodes"]
+    names = {
+        " against ".join(own.values()): experiment.scripted_record(folder, own, n_episodes) for own in experiment.scripted
+    }
+    scripted = {label: read_record(path) for label, path in names.items() if path.is_file()}
+    tested += [(names[label], record) for label, record in scripted.items()]
+    (first, shown_first), *others = tested
+    for path, record in others:
+        ours, theirs = shown_first["test"]["seeds"], record["test"]["seeds"]
+        if ours != theirs:
+            raise ValueError(f"the record {path} is of a test with the seeds {_span(theirs)}, and {first} of {_span(ours)}")
+    return scripted
+
+
+def _span(seeds: Sequence[int]) -> str:
+    return " to ".join(map(str, seeds))
 
 
 def scale_shown(n_seeds: Mapping[float, Sequence[int]], n_cells: int) -> float:
@@ -119,12 +195,17 @@ def quantity(record: Record, of: Quantity, since: float = 0.0) -> float:
     kind, name, metric = of.split("/", 2)
     try:
         if kind == "test":
-            return record["test"]["tests"][name]["mean"][metric]
+            return _number(record["test"]["tests"][name]["mean"][metric])
         curve = record["curve"][name]
         late = np.array(curve["steps"]) >= since * record["identity"]["settings"]["n_timesteps"]
-        return float(np.mean(np.array(curve[metric])[late]))
+        values = np.array(curve[metric], dtype=float)[late]
+        return float(np.mean(values)) if len(values) else np.nan
     except KeyError:
         raise ValueError(f"the records of {record['identity']['experiment']} have no {of}") from None
+
+
+def _number(value: float | None) -> float:
+    return np.nan if value is None else value
 
 
 def label_of(record: Record) -> str:
@@ -149,8 +230,20 @@ def _rng() -> np.random.Generator:
 
 
 def iqm_of(values: np.ndarray) -> Interval:
-    """The IQM over runs with its interval."""
-    return iqm_with_interval({"": values}, _rng())
+    """The IQM over runs with its interval; no number if one of them is none."""
+    return NO_NUMBER if np.isnan(values).any() else iqm_with_interval({"": values}, _rng())
+
+
+def iqm_curve_of(values: np.ndarray) -> list[Interval]:
+    """The IQM over runs at each of several times (times, runs); no number where one of them is none."""
+    lacking = np.isnan(values).any(axis=1)
+    found = iqm_curve(np.where(lacking[:, None], 0.0, values), _rng())
+    return [NO_NUMBER if none else own for none, own in zip(lacking, found, strict=True)]
+
+
+def in_words_or_none(interval: Interval, places: int) -> str:
+    """An interval as tables show it."""
+    return NOT_A_NUMBER if np.isnan(interval.mean) else shown(interval, places)
 
 
 # ---- verdicts
@@ -188,6 +281,8 @@ def judged(claim: Claim, results: Results) -> Verdict:
         n_seeds, border = min(len(values), len(others)), 0.5
         if not n_seeds:
             return Verdict(claim, "", 0, CANNOT_BE_TOLD)
+        if np.isnan([*values, *others]).any():
+            return Verdict(claim, NOT_A_NUMBER, n_seeds, CANNOT_BE_TOLD)
         interval = improvement_with_interval({"": sign * values}, {"": sign * others}, _rng())
         places = decimals(np.concatenate([values, others]))
         sides = f"{shown(iqm_of(values), places)} against {shown(iqm_of(others), places)}"
@@ -197,7 +292,7 @@ def judged(claim: Claim, results: Results) -> Verdict:
         if not n_seeds:
             return Verdict(claim, "", 0, CANNOT_BE_TOLD)
         interval = iqm_of(values)
-        numbers = shown(interval)
+        numbers = in_words_or_none(interval, 2)
         if claim.lower:
             interval, border = Interval(-interval.mean, -interval.high, -interval.low), -border
     return Verdict(claim, numbers, n_seeds, word_for(interval, border, n_seeds))
@@ -226,11 +321,11 @@ def results_table(results: Results) -> str:
     columns = results.experiment.columns
     found = {cell: {name: results.values(cell, of) for name, of in columns.items()} for cell in results.cells}
     every = {name: np.concatenate([own[name] for own in found.values()]) for name in columns}
-    places = {name: max(2, decimals(values)) for name, values in every.items()}
+    places = {name: places_of(values) for name, values in every.items()}
     lower = {name for name, side in results.experiment.better.items() if side == "lower"}
     lines = [["", *(f"{name} {'↓' if name in lower else '↑'}" for name in columns), "seeds"]]
     for cell, records in results.cells.items():
-        numbers = [shown(iqm_of(values), places[name]) for name, values in found[cell].items()]
+        numbers = [in_words_or_none(iqm_of(values), places[name]) for name, values in found[cell].items()]
         lines.append([label_of(records[0]), *numbers, str(len(records))])
         published = results.experiment.published.get(cell)
         if published:
@@ -238,6 +333,12 @@ def results_table(results: Results) -> str:
     for label, record in results.scripted.items():
         lines.append([f"`{label}`", *(_scripted(record, of, places[name]) for name, of in columns.items()), ""])
     return as_markdown(lines)
+
+
+def places_of(values: np.ndarray) -> int:
+    """How many decimals a table shows of some values."""
+    numbers = values[~np.isnan(values)]
+    return max(2, decimals(numbers)) if len(numbers) else 2
 
 
 def _published(value: Any) -> str:
@@ -248,9 +349,10 @@ def _published(value: Any) -> str:
 
 def _scripted(record: Record, of: Quantity, places: int) -> str:
     try:
-        return f"{quantity(record, of):.{places}f}"
+        value = quantity(record, of)
     except (KeyError, ValueError):
         return ""
+    return NOT_A_NUMBER if np.isnan(value) else f"{value:.{places}f}"
 
 
 def effects_table(results: Results) -> str:
@@ -263,12 +365,15 @@ def effects_table(results: Results) -> str:
     rows = []
     for cell, records in results.cells.items():
         values = results.values(cell, of)
-        places = max(2, decimals(np.concatenate([values, base])))
-        line = [label_of(records[0]), shown(iqm_of(values), places)]
-        difference = difference_with_interval(values, base, _rng())
+        places = places_of(np.concatenate([values, base]))
+        line = [label_of(records[0]), in_words_or_none(iqm_of(values), places)]
         if cell == default:
             rows.append((np.inf, [*line, "", "", "", str(len(values))]))
             continue
+        if np.isnan([*values, *base]).any():
+            rows.append((0.0, [*line, NOT_A_NUMBER, "", CANNOT_BE_TOLD, str(len(values))]))
+            continue
+        difference = difference_with_interval(values, base, _rng())
         n_seeds = min(len(values), len(base))
         so = {HOLDS: "better", HOLDS_NOT: "worse"}.get(word_for(difference, 0.0, n_seeds), CANNOT_BE_TOLD)
         least = smallest_difference(values, base)
@@ -298,7 +403,7 @@ def runs_table(results: Mapping[str, Results]) -> str:
                 [
                     *(own.experiment.name, cell, str(len(records)), f"{own.scale:g}"),
                     f"{identity['settings']['n_timesteps']:,}",
-                    f"{curve['episodes'][-1]:,}" if curve else "",
+                    f"{curve['episodes'][-1]:,.0f}" if curve else "",
                     *(clock_time(taken["wall"]), clock_time(taken["processor"]), in_words(taken["memory"])),
                 ]
             )
@@ -307,8 +412,13 @@ def runs_table(results: Mapping[str, Results]) -> str:
                 machines[f"{record['machine']['processor']}, {record['machine']['cores']} cores; {versions}"] += 1
     if len(lines) == 1:
         return "*No run has its record yet.*"
-    told = "\n".join(f"- {count} runs on {machine}" for machine, count in machines.items())
+    told = "\n".join(f"- {n_runs(count)} on {machine}" for machine, count in machines.items())
     return f"{as_markdown(lines)}\n\nMedians over seeds.\n\n{told}"
+
+
+def n_runs(count: int) -> str:
+    """So many runs, in words."""
+    return f"{count} run{'' if count == 1 else 's'}"
 
 
 def table_of(name: str, claims: Sequence[Claim], results: Mapping[str, Results]) -> str:
@@ -342,19 +452,17 @@ def table_of(name: str, claims: Sequence[Claim], results: Mapping[str, Results])
 
 
 def draw_curves(axis: Axes, results: Results, cells: Sequence[str], of: str) -> None:
-    """A curve of each cell over the episodes: the IQM over seeds; beside it, what scripted policies reach."""
+    """A curve of each cell over the env steps: the IQM over seeds; beside it, what scripted policies reach."""
     styles = line_styles({cell: results.algos[cell] for cell in cells})
     for cell in cells:
-        episodes, values = curves(results.cells[cell], of)
-        draw_intervals(
-            axis, episodes, iqm_curve(values, _rng()), styles[cell][0], label_of(results.cells[cell][0]), styles[cell][1]
-        )
+        steps, values = curves(results.cells[cell], of)
+        draw_intervals(axis, steps, iqm_curve_of(values), styles[cell][0], label_of(results.cells[cell][0]), styles[cell][1])
     metric = of.rpartition("/")[2]
     heights = {label: record["test"]["tests"]["own"]["mean"].get(metric) for label, record in results.scripted.items()}
     if len(results.experiment.env_ids) == 1 and len(next(iter(results.experiment.scripted), {})) == 1:
         chosen = ("oracle", "greedy-nearest", "random")
         draw_references(axis, {label: heights[label] for label in chosen if heights.get(label) is not None})
-    axis.set_xlabel("training (episodes)")
+    axis.set_xlabel("training (env steps)")
     axis.set_ylabel(described(metric))
     draw_legend(axis, below=True)
 
@@ -365,13 +473,12 @@ def curves(records: Sequence[Record], of: str) -> tuple[np.ndarray, np.ndarray]:
 
     :param records: seeds of one cell
     :param of: ``curve/<evaluation>/<metric>``
-    :return: episodes, the median over runs (evaluations,), and values (evaluations, runs)
+    :return: env steps (evaluations,), and values (evaluations, runs)
     """
     _, name, metric = of.split("/", 2)
     own = [record["curve"][name] for record in records]
     length = min(len(curve["steps"]) for curve in own)
-    episodes = np.median([curve["episodes"][:length] for curve in own], axis=0)
-    return episodes, np.array([curve[metric][:length] for curve in own]).T
+    return np.array(own[0]["steps"][:length]), np.array([curve[metric][:length] for curve in own], dtype=float).T
 
 
 def draw_scatter(axis: Axes, results: Results, cells: Sequence[str], of: str) -> None:
@@ -380,7 +487,10 @@ def draw_scatter(axis: Axes, results: Results, cells: Sequence[str], of: str) ->
     styles = line_styles({cell: results.algos[cell] for cell in cells})
     for cell in cells:
         first = results.cells[cell][0]
-        returns = first["test"]["tests"][test]["returns"][metric]
+        kept = first["test"]["tests"][test]["returns"]
+        if metric not in kept:
+            raise ValueError(f"the records of {results.experiment.name} have no {metric} of single episodes")
+        returns = np.array(kept[metric], dtype=float)
         axis.plot(
             np.arange(len(returns)), returns, "o", markersize=2.5, alpha=0.5, color=styles[cell][0], label=label_of(first)
         )
@@ -404,11 +514,11 @@ def draw_rivals(axis: Axes, results: Results, cells: Sequence[str], of: str) -> 
     """How often the one side wins, and the other."""
     for cell in cells:
         teams = results.cells[cell][0]["identity"]["settings"]["teams"]
-        episodes, won = curves(results.cells[cell], of)
+        steps, won = curves(results.cells[cell], of)
         for (team, theirs), values, colour in zip(teams.items(), (won, 1 - won), SIDES, strict=True):
-            draw_intervals(axis, episodes, iqm_curve(values, _rng()), colour, f"{algo_label(theirs['algo'])} {team}")
+            draw_intervals(axis, steps, iqm_curve_of(values), colour, f"{algo_label(theirs['algo'])} {team}")
     axis.set_ylim(-0.03, 1.03)
-    axis.set_xlabel("training (episodes)")
+    axis.set_xlabel("training (env steps)")
     axis.set_ylabel("win rate")
     draw_legend(axis, below=True)
 

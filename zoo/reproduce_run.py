@@ -31,9 +31,10 @@ from zoo import sweep_run, train
 from zoo.command_line import BAD_INPUT, REFUSALS, refused, start
 from zoo.match_results import plain
 from zoo.reproduce_plan import LineUp
+from zoo.reproduce_records import IN_A_RUN, measured_file, read_measured, record_in_the_run, require_same, tested
 from zoo.run_groups import METRIC_NAMES
 from zoo.runs import Run
-from zoo.series import evaluation_files, evaluations, progress
+from zoo.series import Progress, evaluation_files, evaluations, progress
 from zoo.sweep_run import Place
 from zoo.workers import end_with_parent, n_cores
 from zoo.worlds import World
@@ -47,6 +48,8 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 N_RETURNS = 500
 """So many returns of the test are kept for a scatter diagram."""
 DIGITS = 5
+MONITOR_HEAD = 2
+"""Lines of a log of all episodes before the first one."""
 
 
 class Measure(BaseCallback):
@@ -64,6 +67,7 @@ class Measure(BaseCallback):
 
     def __init__(self, world: World, line_ups: Mapping[str, LineUp], n_episodes: int, path: Path) -> None:
         super().__init__()
+        self.of = tested({"tests": line_ups, "test_episodes": n_episodes})
         self.world, self.line_ups, self.n_episodes, self.path = world, line_ups, n_episodes, path
         self.test: dict[str, Any] | None = None
         self._before = {"wall": 0.0, "processor": 0.0, "memory": 0}  # what earlier processes took
@@ -71,10 +75,16 @@ class Measure(BaseCallback):
 
     def get_state(self) -> dict[str, Any]:
         """The test, if it was played, and what was taken so far."""
-        return {"test": self.test, "taken": self.taken()}
+        return {"of": self.of, "test": self.test, "taken": self.taken()}
 
     def set_state(self, saved: dict[str, Any]) -> None:
-        """Inverse of :meth:`get_state`."""
+        """
+        Inverse of :meth:`get_state`.
+
+        :raises ValueError: if another test was played
+        """
+        if saved["test"] is not None:
+            require_same("this run", self.of, saved.get("of", {}), "its folder")
         self.test, self._before = saved["test"], saved["taken"]
         self._start()
 
@@ -102,7 +112,7 @@ class Measure(BaseCallback):
 
     def _on_training_end(self) -> None:
         with atomic_write(self.path) as file:
-            file.write(json.dumps({"test": self.test, "taken": self.taken()}).encode())
+            file.write(json.dumps(self.get_state()).encode())
 
 
 def _groups_of(model: Any) -> Sequence[str]:
@@ -150,7 +160,7 @@ def curves_of(run: Run) -> dict[str, dict[str, list[float]]]:
     Every evaluation of a run, by its name: env steps, episodes and seconds at each, and the mean of every metric over its
     episodes.
     """
-    course = progress(run.folder.monitor_file)
+    course = course_of(run)
     found = {}
     for name in evaluation_files(run.folder.path):
         arrays = evaluations(run.folder.path, name)
@@ -162,6 +172,13 @@ def curves_of(run: Run) -> dict[str, dict[str, list[float]]]:
             **{METRIC_NAMES.get(key, key): [rounded(value) for value in own.mean(axis=1)] for key, own in arrays.items()},
         }
     return found
+
+
+def course_of(run: Run) -> Progress:
+    """How far a run was at the end of each episode; of one that was too short for any, only its start."""
+    with run.folder.monitor_file.open(encoding="utf-8") as file:
+        n_lines = sum(1 for _ in file)
+    return progress(run.folder.monitor_file) if n_lines > MONITOR_HEAD else Progress(np.zeros(1), np.zeros(1))
 
 
 def processor_name() -> str:
@@ -186,7 +203,7 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def tidy_up(run: Run) -> None:
-    """Remove what is large of a run that has its record: checkpoints, replay buffers, players, the log of all episodes."""
+    """Remove what is large of a run that keeps its record: checkpoints, replay buffers, players, the log of all episodes."""
     folder = run.folder
     for path in [*checkpoints_in(folder.path).values(), folder.replay_buffer, folder.monitor_file]:
         path.unlink(missing_ok=True)
@@ -194,9 +211,27 @@ def tidy_up(run: Run) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
+def write_copy(run: Run, place: Place, order: Mapping[str, Any]) -> Path:
+    """
+    Write the record of a run that has ended into its folder.
+
+    :param run: the run
+    :param place: of it
+    :param order: what was to be done
+    :return: the file
+    :raises ValueError: if what it is made of is gone, or of another test
+    """
+    found = read_measured(place, order["identity"])
+    command = shlex.join(["python", "zoo/train.py", *order["words"]])
+    about = {"identity": order["identity"], "command": command, **facts(), "taken": found["taken"]}
+    copy = run.folder.path / IN_A_RUN
+    write_record(copy, {**about, "test": found["test"], "curve": curves_of(run)})
+    return copy
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """
-    Train, test, and leave the record.
+    Train, test, and leave the record; it comes at the very end, so that a run that has it is done with.
 
     :param argv: the file of the order, see :meth:`~zoo.reproduce_plan.PlannedRecord.begin`
     :return: exit status of the training; 0, too, if there is a record
@@ -210,23 +245,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         args = train.make_parser().parse_all(order["words"])
         hyperparams = train.resolve(args)
         place = Place(Path(args.log_folder), args.algo, args.env)
-        world = World(args.env, hyperparams.env_kwargs, hyperparams.env_wrapper)
-        measured = place.log.with_suffix(".measured.json")
-        measure = Measure(world, identity["tests"], identity["test_episodes"], measured)
-        status = sweep_run.main(order["words"], [measure])
+        copy = record_in_the_run(place, identity)
+        if copy is None:
+            world = World(args.env, hyperparams.env_kwargs, hyperparams.env_wrapper)
+            measure = Measure(world, identity["tests"], identity["test_episodes"], measured_file(place))
+            status = sweep_run.main(order["words"], [measure])
+            if status:
+                return status
         run = place.run()
-        if status or run is None:
-            return status or BAD_INPUT
-        found = json.loads(measured.read_text(encoding="utf-8"))
-        command = shlex.join(["python", "zoo/train.py", *order["words"]])
-        about = {"identity": identity, "command": command, **facts(), "taken": found["taken"]}
-        write_record(path, {**about, "test": found["test"], "curve": curves_of(run)})
+        if run is None:
+            return BAD_INPUT
+        copy = copy or write_copy(run, place, order)
+        if not order["keep_runs"]:
+            tidy_up(run)
+        with atomic_write(path) as target:
+            target.write(copy.read_bytes())
     except REFUSALS as error:
         return refused(error)
     except OSError as error:
         return refused(OSError(f"the record cannot be written: {error}"))
-    if not order["keep_runs"]:
-        tidy_up(run)
     print(f"the record is {os.path.relpath(path)}")
     return 0
 
