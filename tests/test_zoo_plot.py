@@ -271,7 +271,7 @@ def test_settings_make_lines_of_their_own(tmp_path, capsys):
     assert sizes == {"MADDPG, folder far": 2, "MADDPG, folder plain": 2}
     capsys.readouterr()
 
-    draw(tmp_path, tmp_path)
+    draw(tmp_path, tmp_path / "cell_*")
     error = capsys.readouterr().err
     assert "the runs differ in gamma (0.9, 0.99), policy_kwargs.n_critics (1, 2); --group-by tells them apart" in error
     assert "more than one run has the seed 0, 1" in error

@@ -83,7 +83,7 @@ def test_every_algorithm_meets_every_world_seed_and_setting(tmp_path):
     assert (settings.n_timesteps, settings.env_kwargs["max_steps"], settings.env_kwargs["n_wolves"]) == (10_000, 9, 16)
     assert (settings.model["gamma"], settings.model["learning_rate"]) == (0.9, "lin_1e-3")
     assert settings.model["policy_kwargs"] == {"n_critics": 2, "net_arch": [16, 8]}
-    assert runs[0].hyperparams.model["gamma"] == 0.95  # the preset's
+    assert runs[0].hyperparams.model["gamma"] == 0.9  # the preset's
 
     # its words are a command line of zoo/train.py
     args = train.make_parser().parse_all(last.words)
