@@ -407,6 +407,10 @@ def test_bad_words(tmp_path, capsys, words, sentence):
         ),
         ({"effects": {"default": "maddpg"}}, "spread: effects needs default and quantity, not"),
         (
+            {"effects": {"default": "maddpg", "quantity": "test/own/x", "equal_time": "test/own/x"}},
+            "spread: equal_time of effects is test/own/x; it must be of curve/",
+        ),
+        (
             {"sweeps": [{"algos": ["maddpg"], "envs": ["HardSpread-v0"], "seeds": 3}], "published": {}},
             "spread: seeds of a sweep are not for the file",
         ),
@@ -546,6 +550,27 @@ def test_effects_stand_beside_the_default_the_largest_first():
     assert [(line[0], line[4]) for line in lines] == [("| MADDPG", ""), ("| MADDPG", "worse"), ("| MADDPG", "better")]
     # the middle three of each: 1.0, 1.2 and 0.1
     assert [float(line[2].split(" [")[0]) for line in lines[1:]] == pytest.approx([-0.9, 0.2])
+
+
+def test_effects_at_equal_time():
+    """The twice as slow cell after half of its training, beside the default at its end: a tenth of the curve up to there."""
+    curve = [float(step) for step in range(1, 21)]  # one evaluation per twentieth
+    cells = {cell: [record(cell, seed, curve=curve) for seed in range(5)] for cell in ("default", "slow")}
+    for own in cells["slow"]:
+        own["taken"]["processor"] = 2.0
+    effects = {"default": "default", "quantity": "test/own/x", "equal_time": "curve/eval/x"}
+    experiment = Experiment("e", "E", [{"algos": [*cells], "envs": ["W"]}], effects=effects)
+    head, _, _, line = reproduce_report.effects_table(Results(experiment, 1.0, cells, {})).splitlines()
+    assert [part.strip() for part in head.split("|")[6:8]] == ["time", "difference at equal time (x)"]
+    # evaluations 8 to 10 of 20 beside 18 to 20
+    assert [part.strip() for part in line.split("|")[6:8]] == ["× 2.00", "-10.00 [-10.00, -10.00]"]
+
+
+def test_a_curve_between_two_shares_of_the_training():
+    told = record("a", 0, curve=[1.0, 2.0, 3.0, 4.0])  # after 10, 20, 30 and 40 of 40 env steps
+    for since, until, mean in ((0, 1, 2.5), (0, 0.5, 1.5), (0.5, 0.75, 2.5), (0.6, 0.74, 3), (0.9, 1, 4)):
+        assert reproduce_report.quantity(told, "curve/eval/x", since, until) == mean
+    assert np.isnan(reproduce_report.quantity(told, "curve/eval/x", 0.8, 0.5))
 
 
 def test_the_smallest_difference_by_hand():

@@ -145,8 +145,10 @@ def draw_legend(axis: Axes, below: bool = False) -> None:
     :param axis: where to draw
     :param below: below it in any case, where lines take up the whole picture
     """
-    if below or len(axis.get_legend_handles_labels()[0]) > MOST_WITHIN:
-        axis.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.24), ncols=2)
+    labels = axis.get_legend_handles_labels()[1]
+    if below or len(labels) > MOST_WITHIN:
+        columns = 1 if max(map(len, labels), default=0) > LABEL_WIDTH else 2  # long ones would be wider than the picture
+        axis.legend(fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.24), ncols=columns)
     else:
         axis.legend(fontsize="small")
 

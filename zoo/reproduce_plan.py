@@ -106,7 +106,7 @@ class Experiment:
         weighed = [[of] if isinstance(of, str) else [*of["weights"]] for of in self.columns.values()]
         panels = [panel for own in self.pictures.values() for panel in own if "cells" not in panel or cell in panel["cells"]]
         drawn = [panel[kind] for panel in panels for kind in PANELS if kind in panel]
-        effects = [self.effects["quantity"]] if self.effects else []
+        effects = [of for key, of in self.effects.items() if key != "default"]
         return [*(name for names in weighed for name in names), *drawn, *effects]
 
     @property
@@ -245,8 +245,7 @@ def _experiment(name: str, given: Mapping[str, Any]) -> Experiment:
     panels = [panel for panels in experiment.pictures.values() for panel in panels]
     for panel in panels:
         _check_panel(name, panel)
-    if experiment.effects and experiment.effects.keys() != {"default", "quantity"}:
-        raise ValueError(f"{name}: effects needs default and quantity, not {in_one_line(experiment.effects)}")
+    _check_effects(experiment)
     default = [experiment.effects["default"]] if experiment.effects else []
     for cell in [*experiment.published, *default, *(cell for panel in panels for cell in panel.get("cells", ()))]:
         require_cell(experiment, cell)
@@ -285,6 +284,18 @@ def _check_columns(experiment: Experiment) -> None:
     for column, side in experiment.better.items():
         if side not in SIDES:
             raise ValueError(f'{experiment.name}: better: {column} is "{side}"; it must be {" or ".join(SIDES)}')
+
+
+def _check_effects(experiment: Experiment) -> None:
+    """
+    :raises ValueError: if effects cannot be told
+    """
+    name, effects = experiment.name, experiment.effects
+    if effects and effects.keys() - {"equal_time"} != {"default", "quantity"}:
+        raise ValueError(f"{name}: effects needs default and quantity, not {in_one_line(effects)}")
+    late = effects.get("equal_time", "curve/")
+    if not late.startswith("curve/"):
+        raise ValueError(f"{name}: equal_time of effects is {late}; it must be of curve/…")
 
 
 def _check_panel(name: str, panel: Mapping[str, Any]) -> None:

@@ -39,6 +39,8 @@ HOLDS, HOLDS_NOT, CANNOT_BE_TOLD = "holds", "does not hold", "cannot be told"
 
 SIDES = ("#D55E00", "#0072B2")  # of two teams, as everywhere
 
+EQUAL_TIME = 0.1  # share of the training whose mean is compared when both have had the same time
+
 NOT_A_NUMBER = "not a number"
 NO_NUMBER = Interval(np.nan, np.nan, np.nan)
 
@@ -66,9 +68,13 @@ class Results:
         """Cell → the algorithm that gives it its colour: of the first team, where teams learn by several."""
         return {cell: _algo_of(records[0]) for cell, records in self.cells.items()}
 
-    def values(self, cell: str, of: Quantity, since: float = 0.0) -> np.ndarray:
+    def values(self, cell: str, of: Quantity, since: float = 0.0, until: float = 1.0) -> np.ndarray:
         """A quantity of each run of a cell (runs,)."""
-        return np.array([quantity(record, of, since) for record in self.cells.get(cell, ())])
+        return np.array([quantity(record, of, since, until) for record in self.cells.get(cell, ())])
+
+    def processor_time(self, cell: str) -> float:
+        """Seconds that a run of a cell took of the processor, its evaluations and its test with it: the median."""
+        return float(np.median([record["taken"]["processor"] for record in self.cells[cell]]))
 
 
 def read_results(experiment: Experiment, folder: Path) -> Results:
@@ -181,24 +187,27 @@ def scale_shown(n_seeds: Mapping[float, Sequence[int]], n_cells: int) -> float:
     return max((scale for scale, counts in n_seeds.items() if counts), key=rank, default=0.0)
 
 
-def quantity(record: Record, of: Quantity, since: float = 0.0) -> float:
+def quantity(record: Record, of: Quantity, since: float = 0.0, until: float = 1.0) -> float:
     """
     A number of a run.
 
     :param record: of the run
     :param of: ``test/<test>/<metric>``, ``curve/<evaluation>/<metric>``, or weights of these and what is added
     :param since: mean of a curve from this share of the training on
+    :param until: up to this share of the training; of a time between two evaluations the later one counts
     :raises ValueError: if the record has no such number
     """
     if not isinstance(of, str):
-        return sum(weight * quantity(record, name, since) for name, weight in of["weights"].items()) + of.get("plus", 0.0)
+        parts = [weight * quantity(record, name, since, until) for name, weight in of["weights"].items()]
+        return sum(parts) + of.get("plus", 0.0)
     kind, name, metric = of.split("/", 2)
     try:
         if kind == "test":
             return _number(record["test"]["tests"][name]["mean"][metric])
         curve = record["curve"][name]
-        late = np.array(curve["steps"]) >= since * record["identity"]["settings"]["n_timesteps"]
-        values = np.array(curve[metric], dtype=float)[late]
+        steps, n_timesteps = np.array(curve["steps"]), record["identity"]["settings"]["n_timesteps"]
+        last = min(np.searchsorted(steps, until * n_timesteps), len(steps) - 1)
+        values = np.array(curve[metric], dtype=float)[: last + 1][steps[: last + 1] >= since * n_timesteps]
         return float(np.mean(values)) if len(values) else np.nan
     except KeyError:
         raise ValueError(f"the records of {record['identity']['experiment']} have no {of}") from None
@@ -361,25 +370,44 @@ def effects_table(results: Results) -> str:
     base = results.values(default, of)
     if not len(base):
         return f"*The default, {default}, has not been measured yet.*"
-    head = ["", described(of.rpartition("/")[2]), "difference to the default", "smallest that could be shown", "so", "seeds"]
+    head = ["", described(of.rpartition("/")[2]), "difference to the default", "smallest that could be shown", "so"]
+    late = results.experiment.effects.get("equal_time")
     rows = []
     for cell, records in results.cells.items():
         values = results.values(cell, of)
         places = places_of(np.concatenate([values, base]))
+        difference = difference_between(values, base)
         line = [label_of(records[0]), in_words_or_none(iqm_of(values), places)]
-        if cell == default:
-            rows.append((np.inf, [*line, "", "", "", str(len(values))]))
-            continue
-        if np.isnan([*values, *base]).any():
-            rows.append((0.0, [*line, NOT_A_NUMBER, "", CANNOT_BE_TOLD, str(len(values))]))
-            continue
-        difference = difference_with_interval(values, base, _rng())
-        n_seeds = min(len(values), len(base))
-        so = {HOLDS: "better", HOLDS_NOT: "worse"}.get(word_for(difference, 0.0, n_seeds), CANNOT_BE_TOLD)
-        least = smallest_difference(values, base)
-        line += [shown(difference, places), "" if np.isnan(least) else f"{least:.{places}f}", so, str(len(values))]
-        rows.append((abs(difference.mean), line))
-    return as_markdown([head, *(line for _, line in sorted(rows, key=lambda row: -row[0]))])
+        line += [""] * 3 if cell == default else _effect(values, base, difference, places)
+        if late:
+            line += ["", ""] if cell == default else _at_equal_time(results, cell, default, late, places)
+        rows.append((np.inf if cell == default else abs(np.nan_to_num(difference.mean)), [*line, str(len(values))]))
+    if late:
+        head += ["time", f"difference at equal time ({described(late.rpartition('/')[2])})"]
+    return as_markdown([[*head, "seeds"], *(line for _, line in sorted(rows, key=lambda row: -row[0]))])
+
+
+def difference_between(values: np.ndarray, base: np.ndarray) -> Interval:
+    """The difference of two IQMs with its interval; no number if one of the values is none."""
+    return NO_NUMBER if np.isnan([*values, *base]).any() else difference_with_interval(values, base, _rng())
+
+
+def _effect(values: np.ndarray, base: np.ndarray, difference: Interval, places: int) -> list[str]:
+    """The difference, the smallest one that could be shown, and what follows."""
+    if np.isnan(difference.mean):
+        return [NOT_A_NUMBER, "", CANNOT_BE_TOLD]
+    least = smallest_difference(values, base)
+    word = word_for(difference, 0.0, min(len(values), len(base)))
+    so = {HOLDS: "better", HOLDS_NOT: "worse"}.get(word, CANNOT_BE_TOLD)
+    return [shown(difference, places), "" if np.isnan(least) else f"{least:.{places}f}", so]
+
+
+def _at_equal_time(results: Results, cell: str, default: str, of: str, places: int) -> list[str]:
+    """How many times the default's time a cell takes, and the difference when the slower one has had the other one's time."""
+    times = {name: results.processor_time(name) for name in (cell, default)}
+    until = {name: min(times.values()) / time for name, time in times.items()}
+    values, base = (results.values(name, of, until[name] - EQUAL_TIME, until[name]) for name in (cell, default))
+    return [f"× {times[cell] / times[default]:.2f}", in_words_or_none(difference_between(values, base), places)]
 
 
 def claims_table(claims: Sequence[Claim], results: Mapping[str, Results]) -> str:
@@ -437,9 +465,10 @@ def table_of(name: str, claims: Sequence[Claim], results: Mapping[str, Results])
     if name not in results:
         raise ValueError(f"there is no table {name}; there are claims, runs, {', '.join(results)}")
     own = results[name]
+    tables = {results_table: own.experiment.columns, effects_table: own.experiment.effects}
     if not own.cells:
         return f"*Not measured yet: `python zoo/reproduce.py {name}`.*"
-    parts = [(effects_table if own.experiment.effects else results_table)(own)]
+    parts = [table(own) for table, wanted in tables.items() if wanted]
     if own.scale != 1:
         parts.append(f"At scale {own.scale:g}.")
     for picture in cells_of_pictures(own):
