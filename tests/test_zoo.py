@@ -260,6 +260,8 @@ def test_bad_input_gets_one_sentence_and_leaves_nothing(tmp_path, capsys, words,
         ("Grassland-v0: {n_timesteps: 10, n_envs: 1, bufer_size: 3}", 'did you mean "buffer_size"?'),
         ("Grassland-v0: {n_envs: 1}", "hyperparameter n_timesteps is missing"),
         ("Grassland-v0: !!python/object/apply:os.getcwd []", "is no valid YAML"),
+        ("Grassland-v0: {gamma: 0.9}\nGrassland-v0: {gamma: 0.99}", 'is no valid YAML: "Grassland-v0" stands there twice in'),
+        ("Grassland-v0: {gamma: 0.9, tau: 0.1, gamma: 0.99}", '"gamma" stands there twice in'),
     ],
 )
 def test_bad_yaml_gets_one_sentence(tmp_path, capsys, text, sentence):

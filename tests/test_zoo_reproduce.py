@@ -324,6 +324,12 @@ def test_a_training_that_is_too_short_for_an_episode_has_none_in_its_curve(tmp_p
     assert set(curve["episodes"]) == {0.0} and len(curve["cover_rate"]) == len(curve["steps"])
 
 
+def test_scripted_policies_play_in_the_world_of_the_runs(made):
+    told = json.loads((reproduce.records_folder(made / "docs") / "spread/scripted/40_episodes/random.json").read_text())
+    assert told["identity"]["world"]["env_kwargs"] == {"n_agents": 2, "walls": "none", "max_steps": 5}
+    assert told["test"]["tests"]["own"]["mean"]["length"] == 5
+
+
 def test_scripted_records_of_other_tests_lie_apart_and_are_checked_before_anything_is_begun(made, tmp_path, capsys):
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     path = reproduce.records_folder(tmp_path / "docs") / "spread" / "scripted" / "40_episodes" / "random.json"
@@ -388,6 +394,11 @@ def test_bad_words(tmp_path, capsys, words, sentence):
         (
             {"scripted": [{"agent": "greedy-nearst"}]},
             'spread: unknown scripted policy of \'agent\' "greedy-nearst"; did you mean "greedy-nearest"?',
+        ),
+        ({"tests": {"own": {"agent": "random"}}}, "spread: a test is called own, which is the name of the model's own"),
+        (
+            {"sweeps": [*TINY["experiments"]["spread"]["sweeps"], {"algos": ["per_maddpg"], "envs": ["HardSpread-v0"]}]},
+            "spread has scripted policies, and runs of worlds with different settings",
         ),
         ({"columns": {"x": 3}}, 'spread: the column "x" is 3; it must be a quantity, or have weights of some'),
         (

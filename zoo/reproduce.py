@@ -7,11 +7,12 @@ What each finished run leaves is kept at once, in a small record; a run that has
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -134,7 +135,10 @@ def check_worlds(experiment: Experiment, wanted: Sequence[PlannedRecord], claims
     :param claims: about it
     :raises ValueError: for a metric, a group, a policy or an evaluation that a world or a run of it does not have
     """
-    arenas = {env_id: Arena(World(env_id).make(1)) for env_id in sorted(experiment.env_ids)}
+    worlds = {record.run.env_id: record.world for record in wanted}
+    if experiment.scripted and any(record.world != worlds[record.run.env_id] for record in wanted):
+        raise ValueError(f"{experiment.name} has scripted policies, and runs of worlds with different settings")
+    arenas = {env_id: Arena(world.make(1)) for env_id, world in worlds.items()}
     try:
         for arena in arenas.values():
             _check_names(experiment, arena, [claim.quantity for claim in claims])
@@ -212,12 +216,14 @@ class Scripted:
     Scripted policies that an experiment is read beside.
 
     :param experiment: the experiment
+    :param world: of its runs
     :param line_up: who plays every group
     :param n_episodes: of the test
     :param path: of the record
     """
 
     experiment: Experiment
+    world: World
     line_up: LineUp
     n_episodes: int
     path: Path
@@ -225,7 +231,8 @@ class Scripted:
     @property
     def identity(self) -> dict[str, object]:
         """What the record is of."""
-        return {"experiment": self.experiment.name, "players": self.line_up, "test_episodes": self.n_episodes}
+        about = {"experiment": self.experiment.name, "world": asdict(self.world)}
+        return json.loads(json.dumps({**about, "players": self.line_up, "test_episodes": self.n_episodes}))
 
 
 def scripted_beside(wanted: Sequence[PlannedRecord], records: Path) -> list[Scripted]:
@@ -240,7 +247,7 @@ def scripted_beside(wanted: Sequence[PlannedRecord], records: Path) -> list[Scri
     for record in wanted:
         for line_up in record.experiment.scripted:
             path = record.experiment.scripted_record(records, line_up, record.n_test_episodes)
-            found[path] = Scripted(record.experiment, line_up, record.n_test_episodes, path)
+            found[path] = Scripted(record.experiment, record.world, line_up, record.n_test_episodes, path)
     return [own for own in found.values() if not is_there(own.path, own.identity)]
 
 
@@ -252,8 +259,7 @@ def play_scripted(scripted: Sequence[Scripted]) -> None:
     """
     for own in scripted:
         print(f"{own.experiment.name}: {', '.join(own.line_up.values())} …", flush=True)
-        (env_id,) = own.experiment.env_ids
-        test = played(World(env_id), {OWN: own.line_up}, own.n_episodes)
+        test = played(own.world, {OWN: own.line_up}, own.n_episodes)
         write_record(own.path, {"identity": own.identity, **facts(), "test": test})
 
 

@@ -17,6 +17,7 @@ from zoo.run_folder import read_map
 from zoo.sweep_plan import KEYS, PlannedRun, in_one_line, plan
 from zoo.train import make_parser
 from zoo.typed_settings import checked
+from zoo.worlds import World
 
 EXPERIMENTS = HYPERPARAMS / "reproduce.yml"
 ALL = "all"
@@ -172,6 +173,12 @@ class PlannedRecord:
     n_test_episodes: int
 
     @property
+    def world(self) -> World:
+        """Where the run trains, and is tested."""
+        hyperparams = self.run.hyperparams
+        return World(self.run.env_id, hyperparams.env_kwargs, hyperparams.env_wrapper)
+
+    @property
     def identity(self) -> dict[str, Any]:
         """What the record is of, as JSON holds it: a run with another one is another run."""
         run = self.run
@@ -233,14 +240,7 @@ def _experiment(name: str, given: Mapping[str, Any]) -> Experiment:
     experiment = Experiment(name, **own)
     require_count(f"{name}: seeds", experiment.seeds)
     require_count(f"{name}: test_episodes", experiment.test_episodes, least=2)
-    for sweep in experiment.sweeps:
-        worlds = sweep.get("envs", ())
-        if len(worlds) > 1:
-            raise ValueError(
-                f"{name}: a sweep has the worlds {_listed(worlds)}; give each a sweep or an experiment of its own"
-            )
-    if experiment.scripted and len(experiment.env_ids) != 1:
-        raise ValueError(f"the experiment {name} has scripted policies and {len(experiment.env_ids)} worlds; it must have one")
+    _check_worlds(experiment)
     _check_columns(experiment)
     panels = [panel for panels in experiment.pictures.values() for panel in panels]
     for panel in panels:
@@ -271,6 +271,23 @@ def _column(name: str, heading: str, of: Any) -> Any:
             f'{name}: the column "{heading}" is {in_one_line(of)}; it must be a quantity, or have weights of some'
         )
     return checked(f'key of the column "{heading}" of {name}', of, {"weights": dict[str, float], "plus": float})
+
+
+def _check_worlds(experiment: Experiment) -> None:
+    """
+    :raises ValueError: if its runs cannot be told apart by their cells, or its tests and scripted policies cannot be played
+    """
+    name = experiment.name
+    for sweep in experiment.sweeps:
+        worlds = sweep.get("envs", ())
+        if len(worlds) > 1:
+            raise ValueError(
+                f"{name}: a sweep has the worlds {_listed(worlds)}; give each a sweep or an experiment of its own"
+            )
+    if OWN in experiment.tests:
+        raise ValueError(f"{name}: a test is called {OWN}, which is the name of the model's own; call it otherwise")
+    if experiment.scripted and len(experiment.env_ids) != 1:
+        raise ValueError(f"the experiment {name} has scripted policies and {len(experiment.env_ids)} worlds; it must have one")
 
 
 def _check_columns(experiment: Experiment) -> None:

@@ -291,14 +291,28 @@ def _as_yaml(values: Mapping[str, Any]) -> str:
     return yaml.safe_dump(dict(values), sort_keys=False, allow_unicode=True)
 
 
+class UniqueKeys(yaml.SafeLoader):
+    """PyYAML lets the last of equal keys win without a word; here they are an error, as YAML itself has it."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        node = super().compose_mapping_node(anchor)
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode):
+                if (key.tag, key.value) in seen:
+                    raise yaml.constructor.ConstructorError(None, None, f'"{key.value}" stands there twice', key.start_mark)
+                seen.add((key.tag, key.value))
+        return node
+
+
 def read_map(path: Path) -> dict[str, Any]:
     """
     A YAML file that holds a map.
 
-    :raises ValueError: if it is missing, no YAML, or something else
+    :raises ValueError: if it is missing, no YAML, has equal keys, or is something else
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.load(path.read_text(encoding="utf-8"), UniqueKeys)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
