@@ -75,4 +75,9 @@ def test_bad_input(logs, tmp_path, capsys):
     ):
         assert gallery.main([*words, "-o", str(tmp_path / "out")]) == 2
         assert message in capsys.readouterr().err
+    run = tmp_path / "logs" / "maddpg" / "HardSpread-v0_1"
+    shutil.copytree(logs / "maddpg" / "HardSpread-v0_1", run)
+    (run / "evaluations.npz").write_bytes((run / "evaluations.npz").read_bytes()[:-30])
+    assert gallery.main([str(tmp_path / "logs"), "-o", str(tmp_path / "out")]) == 2
+    assert f"{run}/evaluations.npz cannot be read" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -192,13 +192,14 @@ def build(args: argparse.Namespace) -> dict[str, list[Run]]:
     The runs of each world.
 
     :param args: the command line
-    :raises ValueError: one sentence that says what is wrong
+    :raises ValueError: one sentence that says what is wrong, with a damaged file of evaluations, too
     """
     require_count("-n", args.n_episodes, least=2)
     require_count("--films", args.films, least=0)
     require_count("--seed", args.seed, least=0)
     worlds: dict[str, list[Run]] = {}
     for run in find_runs(args.runs):
+        rewards(run)  # refuses damaged ones
         worlds.setdefault(run.env_id, []).append(run)
     return worlds
 

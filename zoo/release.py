@@ -37,7 +37,7 @@ from zoo.match_results import write_text
 from zoo.playing import main_quantities
 from zoo.release_card import Candidate, Card, Measured
 from zoo.run_folder import RunFolder, file_name, file_to_play
-from zoo.run_groups import Group, differences, first_of, grouped, note, only
+from zoo.run_groups import Group, differences, first_of, grouped, note, only, rewards
 from zoo.runs import Run, find_runs
 from zoo.series import evaluation_files, evaluations
 from zoo.teams import with_some_sense
@@ -198,12 +198,9 @@ def _score(run: Run, best: bool) -> float | None:
 
     :raises ValueError: if one of its files of evaluations is damaged
     """
-    found = {name: evaluations(run.folder.path, name) for name in evaluation_files(run.folder.path)}
-    if "eval" not in found:
-        return None
-    if "results" not in found["eval"]:
-        raise ValueError(f"{evaluation_files(run.folder.path)['eval']} holds no rewards of evaluations")
-    means = found["eval"]["results"].mean(axis=1)
+    for name in evaluation_files(run.folder.path):
+        evaluations(run.folder.path, name)  # refuses a damaged one
+    means = rewards(run)
     return float(means.max() if best else means[-1]) if len(means) else None
 
 

@@ -15,7 +15,7 @@ from zoo.hyperparams import flat
 from zoo.match_results import described
 from zoo.plots import ALGO_LABELS
 from zoo.runs import Run
-from zoo.series import Progress, evaluations, progress
+from zoo.series import Progress, evaluation_files, evaluations, progress
 from zoo.statistics import ENOUGH_RUNS
 
 # The metric of whoever asks for none.
@@ -162,11 +162,18 @@ def metrics_of(run: Run, eval_name: str) -> dict[str, tuple[np.ndarray, np.ndarr
 
 
 def rewards(run: Run) -> np.ndarray:
-    """The mean reward of each evaluation of a run (evaluations,); empty where there is none."""
-    try:
-        return np.mean(evaluations(run.folder.path)["results"], axis=1)
-    except ValueError:
+    """
+    The mean reward of each evaluation of a run (evaluations,); empty where there is none.
+
+    :raises ValueError: for a file of evaluations that is damaged
+    """
+    file = evaluation_files(run.folder.path).get("eval")
+    if file is None:
         return np.empty(0)
+    found = evaluations(run.folder.path)
+    if "results" not in found:
+        raise ValueError(f"{file} holds no rewards of evaluations")
+    return np.mean(found["results"], axis=1)
 
 
 def metric_label(metric: str, eval_name: str) -> str:
