@@ -64,8 +64,8 @@ class KFCVReplayBuffer(JointReplayBuffer):
 
     :param n_folds: K: folds, teachers, buckets and stages
     :param refresh_every: updates between refreshes (Algorithm 1 as printed refreshes at every step, at many times the cost)
-    :param refresh_fraction: refresh sooner when this share of the transitions is new (beyond 1: never sooner), as soon as
-        ``scored_per_update`` allows for all transitions
+    :param refresh_fraction: refresh sooner when this share of the transitions is new and ``scored_per_update`` allows to work
+        on all of the buffer; beyond 1: never sooner
     :param scored_per_update: bound of the cost: a refresh works on at most this many transitions per update since the last
         one, whatever the size of the buffer and the number of worlds that fill it
     :param teacher_steps: gradient steps of the teachers per refresh

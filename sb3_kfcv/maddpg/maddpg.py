@@ -50,7 +50,8 @@ class MADDPG(JointAlgorithm):
     (see :class:`~sb3_kfcv.vec_env.joint_env.JointEnv`). A PettingZoo parallel env is wrapped by itself.
 
     :param policy: ``"MlpPolicy"`` or a subclass of :class:`MADDPGPolicy`
-    :param env: a gym id such as ``"Grassland-v0"``, a PettingZoo ``ParallelEnv``, a joint env, or a ``VecEnv`` of such
+    :param env: a gym id such as ``"Grassland-v0"``, the name of a PettingZoo world such as ``"mpe2/simple_tag_v3"``, a
+        PettingZoo ``ParallelEnv``, a joint env, or a ``VecEnv`` of such
     :param learning_rate: of actors and critics; a number, ``"lin_1e-3"`` (falls linearly to 0), an SB3 schedule, or a
         registered function of the remaining progress (see :func:`sb3_kfcv.register`)
     :param buffer_size: joint transitions held
@@ -67,7 +68,7 @@ class MADDPG(JointAlgorithm):
     :param optimize_memory_usage: nothing depends on it: the replay buffer never stores an observation twice
     :param critic_input: what critics see beside all actions: ``"observations"`` (all agents', as in the paper), ``"state"``
         (the world's ``state()``) or ``"own_observation"`` (the agent's own); the latter two make the critics' first layer
-        many times smaller, and lose nothing where every agent sees the whole world
+        many times smaller, and lose no information where every agent sees the whole world
     :param share_parameters: one actor and one critic per group of agents instead of per agent. The critic reads the joint
         input with the agent itself first; both tell the agents apart by a learnt bias, as by a one-hot index in the input
     :param team: learn only the agents of this group; the others act by ``opponents``

@@ -301,7 +301,8 @@ class MADDPGPolicy(ActorPolicy):
     :param share_parameters: one actor and one critic per group instead of per agent
     :param layer_norm: put a layer norm, as of ``torch.nn.LayerNorm``, before each activation of actors and critics
     :param optimizer_class: optimiser of actors and of critics
-    :param optimizer_kwargs: its arguments, without the learning rate; Adam is fused by default (several times faster)
+    :param optimizer_kwargs: its arguments, without the learning rate; by default Adam is fused (several times faster), which
+        arguments of one's own must say, too: ``fused=True``
     """
 
     actor_target: StackedActors

@@ -41,7 +41,7 @@ class JointReplayBufferSamples(NamedTuple):
     next_states: th.Tensor  # (batch, state)
     weights: th.Tensor  # (batch,): importance weights of the critic loss
     rows: np.ndarray  # (batch,): where the transitions lie in the buffer
-    discounts: th.Tensor | None = None
+    discounts: th.Tensor | None = None  # SB3's field for n-step returns, which are not made here
 
 
 class Minibatch:
