@@ -5,7 +5,9 @@ import copy
 import pytest
 import torch as th
 
+from sb3_kfcv import MADDPG
 from sb3_kfcv.common.adam import LeanAdam
+from sb3_kfcv.envs import hard_spread_v0
 
 SETTINGS = {
     "defaults": {},
@@ -112,3 +114,14 @@ def test_a_cleared_state_begins_anew():
                 optimizer.state.clear()
             step(optimizer, seed)
         equal(ours, theirs)
+
+
+@pytest.mark.parametrize(
+    ("optimizer_kwargs", "fused"), [(None, True), ({"eps": 1e-5}, True), ({"fused": False}, False), ({"foreach": True}, False)]
+)
+def test_adam_is_fused_unless_it_is_to_be_otherwise(optimizer_kwargs, fused):
+    kwargs = {"net_arch": [4], "optimizer_kwargs": optimizer_kwargs}
+    model = MADDPG("MlpPolicy", hard_spread_v0.parallel_env(n_agents=2), policy_kwargs=kwargs, device="cpu")
+    for network in (model.actor, model.critic):
+        assert isinstance(network.optimizer, LeanAdam) == fused
+        assert network.optimizer.defaults["eps"] == (optimizer_kwargs or {}).get("eps", 1e-8)

@@ -73,7 +73,7 @@ def test_results_do_not_depend_on_the_number_of_worlds(tmp_path, runs):
 
 def test_patterns_checkpoints_and_best_models_are_found(tmp_path, runs):
     run = runs / "Grassland-v0_1"
-    best = play(tmp_path, "--best", "--team", f"sheep={run}", "wolf=chase")
+    best = play(tmp_path, "--load-best", "--team", f"sheep={run}", "wolf=chase")
     assert list(best["players"]["sheep"]) == ["maddpg_1 best"]
     assert (best["rows"], best["metric"]) == ("sheep", "won_sheep")
 
@@ -153,7 +153,7 @@ REFUSED = [
     ("--team wolf={tmp}/damaged.zip", "damaged"),
     ("--team wolf={tmp}/other.zip", "is for another world: 1 wolf"),
     ("--team sheep={runs}/Grassland-v0_3", "plays wolf; wanted is a player of sheep"),
-    ("--best --team wolf={tmp}/begun/Grassland-v0_1", "has no best_wolf.zip and no best_model.zip yet"),
+    ("--load-best --team wolf={tmp}/begun/Grassland-v0_1", "has no best_wolf.zip and no best_model.zip yet"),
     ("--team wolf={tmp}/begun/Grassland-v0_1", "has no model and no checkpoint yet"),
     ("--curve {tmp}/begun/Grassland-v0_1 --against sheep=graze", "has no checkpoint and no saved player of wolf yet"),
     ("--metric won_wolves", 'unknown metric "won_wolves"; did you mean "won_wolf"?'),

@@ -386,6 +386,13 @@ REFUSED = [
     (evaluate, "{tmp}/alone.zip --env Grassland-v0 {world}", "nobody plays sheep beside alone: add --team sheep=random"),
     (evaluate, "chase --env Grassland-v0", "nobody plays sheep beside chase: add --team sheep=random"),
     (evaluate, "chaise --env Grassland-v0", 'unknown scripted policy of \'wolf\' "chaise"; did you mean "chase"?'),
+    (evaluate, "{logs} --algo ddpg", "there is no run of ddpg below {logs}; there is "),
+    (
+        evaluate,
+        "{logs} --env mpe2/simple_spread_v3",
+        "there is no run in mpe2/simple_spread_v3 below {logs}; there is ",
+    ),
+    (evaluate, "{one} --algo kfcv_maddpg", "there is no run of kfcv_maddpg below {one}; there is maddpg in Grassland-v0"),
     (evaluate, "{one}/transitions", "there is no run of zoo/train.py in {one}/transitions"),
     (evaluate, "{tmp}/nothing.zip", "there is no file {tmp}/nothing.zip to take a player of"),
     (evaluate, "{logs}/maddpg/Grassland-v0_9", 'unknown run folder "{logs}/maddpg/Grassland-v0_9"; did you mean'),

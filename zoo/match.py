@@ -73,7 +73,7 @@ def make_parser() -> Parser:
     )
     add("-n", "--n-episodes", type=whole_number, default=200, help="of each match (default: %(default)s)")
     add("--seed", type=int, default=0, help="of the first episode of every match (default: %(default)s)")
-    add("--best", action="store_true", help="of run folders take best_model.zip, not the last model")
+    add("--load-best", action="store_true", help="of run folders take best_model.zip, not the last model")
     add("--metric", help="what the table shows (default: win rate of the rows where the world says who wins, else return)")
     add(
         "--curve", action="append", default=[], metavar="RUN_DIR", help="measure a run over its training, too; may be repeated"
@@ -195,7 +195,9 @@ def build(args: argparse.Namespace) -> Matches:
     sources, players = {}, {}
     for group in order:
         default = scripted_for(arena.layout, group) if group in groups else [RANDOM]
-        sources[group] = labelled([one for word in named.get(group, default) for one in fit(arena, group, word, args.best)])
+        sources[group] = labelled(
+            [one for word in named.get(group, default) for one in fit(arena, group, word, args.load_best)]
+        )
         if group not in groups and len(sources[group]) > 1:
             raise ValueError(
                 f"{' and '.join(groups)} make the table; give {group} one player, not {', '.join(sources[group])}"
@@ -206,7 +208,7 @@ def build(args: argparse.Namespace) -> Matches:
     opponents = {group: arena.side(group, RANDOM) for group in known}
     opponents |= {group: one for group, own in players.items() if group not in groups for one in own.values()}
     for group, (word,) in against.items():
-        files = found(word, group, args.best)
+        files = found(word, group, args.load_best)
         if len(files) > 1:
             raise ValueError(f"--against {args.against} means {len(files)} players; give one")
         opponents[group] = side(arena, group, files[0])

@@ -80,7 +80,12 @@ def make_parser() -> Parser:
     add("--space", metavar="FILE", help="YAML file of the search space (default: hyperparams/search.yml)")
     add("--sampler", default="tpe", help=f"{' or '.join(SAMPLERS)} (default: %(default)s)")
     add("--pruner", default="median", help=f"{', '.join(PRUNERS)} (default: %(default)s)")
-    add("--n-startup-trials", type=int, default=10, help="drawn at random, and none cut short (default: %(default)s)")
+    add(
+        "--n-startup-trials",
+        type=int,
+        default=10,
+        help="drawn at random; the median pruner cuts none of them short (default: %(default)s)",
+    )
     add("-conf", "--conf-file", help="YAML file of the settings that are not searched (default: hyperparams/<algo>.yml)")
     add("--preset", help="default or tuned: these settings, likewise")
     add("-params", "--hyperparams", **PAIRS, help="overwrite them; what is searched wins over them")

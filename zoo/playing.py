@@ -208,11 +208,30 @@ def _expanded(word: str, args: argparse.Namespace) -> list[str]:
         runs = runs_below(path) if Path(path).is_dir() else []
         if Path(path).is_dir() and not runs:
             raise ValueError(f"there is no run of zoo/train.py in {path}")
-        runs = [run for run in runs if args.algo in (None, run.algo) and args.env in (None, run.env_id)] or runs[:1]
+        runs = _fitting(path, runs, args)
         if "," not in path and is_named(path) and not Path(path).is_dir() and not existing(Path(path)).is_file():
             (file_to_play if Path(path).suffix else RunFolder.existing)(path)  # say what there is instead
         expanded += [str(run.folder.path) for run in runs] or [path]
     return expanded
+
+
+def _fitting(path: str, runs: Sequence[Run], args: argparse.Namespace) -> list[Run]:
+    """
+    The runs of ``--algo`` and in ``--env``, where these are given; a run that is named itself may play in another world.
+
+    :param path: that means them
+    :param runs: below it
+    :raises ValueError: if there are runs, but none such
+    """
+    of_it = [run for run in runs if args.algo in (None, run.algo)]
+    fitting = (
+        of_it if [run.folder.path for run in runs] == [Path(path)] else [r for r in of_it if args.env in (None, r.env_id)]
+    )
+    if runs and not fitting:
+        wanted = " ".join([f"of {args.algo}"] * bool(args.algo) + [f"in {args.env}"] * bool(args.env))
+        there = ", ".join(dict.fromkeys(f"{run.algo} in {run.env_id}" for run in runs))
+        raise ValueError(f"there is no run {wanted} below {path}; there is {there}")
+    return fitting
 
 
 def _is_complete(args: argparse.Namespace, runs: Sequence[Run]) -> bool:

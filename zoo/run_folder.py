@@ -312,7 +312,7 @@ def read_map(path: Path) -> dict[str, Any]:
     :raises ValueError: if it is missing, no YAML, has equal keys, or is something else
     """
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), UniqueKeys)
+        content = UniqueKeys(path.read_text(encoding="utf-8")).get_single_data()
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -15,7 +15,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> str:
     :param known: the names that exist
     :return: ``unknown environment "Graslnd-v0"; did you mean "Grassland-v0"?``, or the list of all known ones
     """
-    known = sorted(known)
+    known = sorted({*known})
     close = get_close_matches(str(name), known, n=1, cutoff=0.5)
     hint = f'did you mean "{close[0]}"?' if close else f"known: {', '.join(known)}"
     return f'unknown {kind} "{name}"; {hint}'

@@ -301,8 +301,8 @@ class MADDPGPolicy(ActorPolicy):
     :param share_parameters: one actor and one critic per group instead of per agent
     :param layer_norm: put a layer norm, as of ``torch.nn.LayerNorm``, before each activation of actors and critics
     :param optimizer_class: optimiser of actors and of critics
-    :param optimizer_kwargs: its arguments, without the learning rate; by default Adam is fused (several times faster), which
-        arguments of one's own must say, too: ``fused=True``
+    :param optimizer_kwargs: its arguments, without the learning rate; Adam is fused (several times faster) unless they say
+        otherwise
     """
 
     actor_target: StackedActors
@@ -326,8 +326,9 @@ class MADDPGPolicy(ActorPolicy):
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
         require_count("n_critics", n_critics)
-        if optimizer_kwargs is None:
-            optimizer_kwargs = {"fused": True} if optimizer_class is th.optim.Adam else {}
+        optimizer_kwargs = optimizer_kwargs or {}
+        if optimizer_class is th.optim.Adam and not {"fused", "foreach", "differentiable"} & optimizer_kwargs.keys():
+            optimizer_kwargs = {"fused": True, **optimizer_kwargs}
         actor_arch, critic_arch = hidden_sizes(net_arch)
         super().__init__(
             observation_space,
