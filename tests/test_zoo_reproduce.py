@@ -13,9 +13,10 @@ from test_zoo import ROOT
 
 from sb3_kfcv.common.evaluation import Interval
 from zoo import pages, reproduce, reproduce_report, reproduce_run, train
-from zoo.reproduce_plan import EXPERIMENTS, Claim, Experiment, planned, read_experiments
+from zoo.reproduce_plan import EXPERIMENTS, OF_THE_CURRICULUM, Claim, Experiment, planned, read_experiments
 from zoo.reproduce_records import is_there, read_record
 from zoo.reproduce_report import CANNOT_BE_TOLD, HOLDS, HOLDS_NOT, NOT_A_NUMBER, Results, judged, word_for
+from zoo.series import tensorboard_series
 from zoo.statistics import difference_with_interval, smallest_difference
 
 SMALL = {"n_envs": 2, "learning_starts": 20, "batch_size": 8, "buffer_size": 200}
@@ -324,6 +325,23 @@ def test_a_training_that_is_too_short_for_an_episode_has_none_in_its_curve(tmp_p
     assert set(curve["episodes"]) == {0.0} and len(curve["cover_rate"]) == len(curve["steps"])
 
 
+def test_records_hold_what_the_curriculum_logged_while_it_lasted(made):
+    plain, kfcv = wanted(made)
+    told = json.loads(kfcv.path.read_text())["curve"]
+    during, at = told["curriculum"], told["eval"]["steps"]
+    logged = tensorboard_series(kfcv.run.place.run().tensorboard_folder)
+    last = logged["curriculum/unscored"].steps[-1]
+    assert 0 < last < at[-1] and set(during["steps"]) <= {*at} and during["steps"][-1] >= last
+    for name in OF_THE_CURRICULUM:
+        series = logged[f"curriculum/{name}"]
+        for step, value in zip(during["steps"], during[name], strict=True):
+            before = max([0, *(other for other in at if other < step)])
+            both = np.isin(series.steps, logged["curriculum/rank_correlation_with_last"].steps) & (series.steps <= last)
+            own = series.values[both & (before < series.steps) & (series.steps <= step)]
+            assert value == pytest.approx(own.mean(), rel=1e-4, abs=1e-9)
+    assert "curriculum" not in json.loads(plain.path.read_text())["curve"]
+
+
 def test_scripted_policies_play_in_the_world_of_the_runs(made):
     told = json.loads((reproduce.records_folder(made / "docs") / "spread/scripted/40_episodes/random.json").read_text())
     assert told["identity"]["world"]["env_kwargs"] == {"n_agents": 2, "walls": "none", "max_steps": 5}
@@ -384,6 +402,14 @@ def test_bad_words(tmp_path, capsys, words, sentence):
         (
             {"pictures": {"a": [{"title": "a", "scatter": "test/own/collisions"}]}},
             "spread: a: of single episodes tests keep return_agent, not test/own/collisions",
+        ),
+        (
+            {"pictures": {"a": [{"title": "a", "curve": "curve/curriculum/teacher_loss_in_fold"}]}},
+            'spread: unknown evaluation of maddpg "curriculum"; known: eval',
+        ),
+        (
+            {"pictures": {"a": [{"title": "a", "curve": "curve/curriculum/cover_rate", "cells": ["kfcv_maddpg"]}]}},
+            'spread: unknown metric "cover_rate"; known: rank_correlation_with_last',
         ),
         (
             {"pictures": {"a": [{"title": "a", "curve": "curve/evel/cover_rate"}]}},

@@ -26,7 +26,9 @@ from sb3_kfcv.saving.checkpoints import checkpoints_in
 from zoo.command_line import REFUSALS, SEVERAL, Parser, as_it_was_typed, refused, start, whole_number
 from zoo.hyperparams import CO_TRAINING
 from zoo.reproduce_plan import (
+    CURRICULUM,
     EXPERIMENTS,
+    OF_THE_CURRICULUM,
     OWN,
     Claim,
     Experiment,
@@ -169,9 +171,10 @@ def _check_names(experiment: Experiment, arena: Arena, further: Sequence[str]) -
             raise ValueError(f"scripted names {', '.join(line_up) or 'nobody'}; to be played are {', '.join(groups)}")
     known = {REWARD, *arena.quantities()}
     for of in [*experiment.quantities, *further]:
-        metric = of.split("/", 2)[2]
-        if metric not in known:
-            raise ValueError(unknown_name("metric", metric, known))
+        _, name, metric = of.split("/", 2)
+        metrics = OF_THE_CURRICULUM if name == CURRICULUM else known
+        if metric not in metrics:
+            raise ValueError(unknown_name("metric", metric, metrics))
     kept = f"return_{groups[0]}"
     for panel in [panel for panels in experiment.pictures.values() for panel in panels if "scatter" in panel]:
         if panel["scatter"].split("/", 2)[2] != kept:
@@ -190,6 +193,8 @@ def _check_evaluations(record: PlannedRecord, arena: Arena, claims: Sequence[Cla
     learners = list(run.hyperparams.model.get("teams", [team] if team else []))
     found = yardsticks(run.args.yardstick, arena.layout, learners, run.algo == CO_TRAINING)
     known = ["eval", *(yardstick.name for yardstick in found)]
+    if run.algo == "kfcv_maddpg":
+        known.append(CURRICULUM)
     claimed = [claim.quantity for claim in claims if cell in (claim.cell, claim.than)]
     for of in [*record.experiment.quantities_of(cell), *claimed]:
         kind, name, _ = of.split("/", 2)

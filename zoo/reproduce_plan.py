@@ -33,6 +33,15 @@ OWN = "own"
 # Flags of zoo/train.py, beside the settings, that decide on what a record holds.
 FLAGS = ("eval_freq", "eval_episodes", "n_eval_envs", "eval_env_kwargs", "yardstick")
 
+# What runs with a curriculum log of it, as a curve of this name.
+CURRICULUM = "curriculum"
+OF_THE_CURRICULUM = (
+    "rank_correlation_with_last",
+    "rank_correlation_with_student",
+    "teacher_loss_in_fold",
+    "teacher_loss_held_out",
+)
+
 LineUp = dict[str, str]
 
 EXPERIMENT_KEYS = {

@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +31,11 @@ from sb3_kfcv.saving.files import atomic_write
 from zoo import sweep_run, train
 from zoo.command_line import BAD_INPUT, REFUSALS, refused, start
 from zoo.match_results import plain
-from zoo.reproduce_plan import LineUp
+from zoo.reproduce_plan import CURRICULUM, OF_THE_CURRICULUM, LineUp
 from zoo.reproduce_records import IN_A_RUN, measured_file, read_measured, record_in_the_run, require_same, tested
 from zoo.run_groups import METRIC_NAMES
 from zoo.runs import Run
-from zoo.series import Progress, evaluation_files, evaluations, progress
+from zoo.series import Progress, evaluation_files, evaluations, progress, tensorboard_series
 from zoo.sweep_run import Place
 from zoo.workers import end_with_parent, n_cores
 from zoo.worlds import World
@@ -158,20 +159,57 @@ def rounded(value: float) -> float:
 def curves_of(run: Run) -> dict[str, dict[str, list[float]]]:
     """
     Every evaluation of a run, by its name: env steps, episodes and seconds at each, and the mean of every metric over its
-    episodes.
+    episodes. Of a curriculum, while it lasts, the means since the evaluation before.
     """
     course = course_of(run)
     found = {}
     for name in evaluation_files(run.folder.path):
         arrays = evaluations(run.folder.path, name)
         steps = arrays.pop("timesteps")
-        found[name] = {
-            "steps": steps.tolist(),
-            "episodes": course.episodes_at(steps).tolist(),
-            "seconds": [rounded(value) for value in course.seconds_at(steps)],
-            **{METRIC_NAMES.get(key, key): [rounded(value) for value in own.mean(axis=1)] for key, own in arrays.items()},
-        }
+        found[name] = curve(course, steps, {METRIC_NAMES.get(key, key): own.mean(axis=1) for key, own in arrays.items()})
+        if name == "eval":
+            during, values = curriculum_of(run, steps)
+            if values:
+                found[CURRICULUM] = curve(course, during, values)
     return found
+
+
+def curve(course: Progress, steps: np.ndarray, values: Mapping[str, np.ndarray]) -> dict[str, list[float]]:
+    """
+    Values over a training.
+
+    :param course: of the training
+    :param steps: env steps (times,)
+    :param values: name → value at each (times,)
+    """
+    return {
+        "steps": steps.tolist(),
+        "episodes": course.episodes_at(steps).tolist(),
+        "seconds": [rounded(value) for value in course.seconds_at(steps)],
+        **{name: [rounded(value) for value in own] for name, own in values.items()},
+    }
+
+
+def curriculum_of(run: Run, at: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """
+    What a run has logged of its curriculum while that lasted.
+
+    :param run: the run
+    :param at: env steps (times,)
+    :return: those of these times since the last of which something was logged, and name → the mean of what was
+    """
+    logged = tensorboard_series(run.tensorboard_folder)
+    series = {name: logged[f"curriculum/{name}"] for name in OF_THE_CURRICULUM if f"curriculum/{name}" in logged}
+    if "curriculum/unscored" not in logged or not series:  # logged while transitions have scores, and draws go by them
+        return at[:0], {}
+    together = reduce(np.intersect1d, [logged["curriculum/unscored"].steps, *(own.steps for own in series.values())])
+    until = np.searchsorted(at, together)
+    times = np.unique(until[until < len(at)])
+    means = {}
+    for name, own in series.items():
+        values = own.values[np.isin(own.steps, together)]
+        means[name] = np.array([values[until == time].mean() for time in times])
+    return at[times], means
 
 
 def course_of(run: Run) -> Progress:
