@@ -29,6 +29,7 @@ HEAT_MAP = "cividis"  # reads the same with every kind of colour vision
 DPI = 150
 PANELS_PER_ROW = 3
 LABEL_WIDTH = 26  # characters
+TITLE_WIDTH = 11  # characters per inch
 MOST_WITHIN = 4  # lines of a legend that leave room for the picture
 MOST_MARKERS = 60  # points of a line that are still told apart
 
@@ -55,7 +56,7 @@ def new_figure(
         axis.spines[["top", "right"]].set_visible(False)
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
     if title:
-        figure.suptitle(title)
+        figure.suptitle(fill(title, int(TITLE_WIDTH * size[0] * columns)))
     return figure, axes[:n_panels]
 
 
