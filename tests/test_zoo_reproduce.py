@@ -444,8 +444,8 @@ def test_bad_words(tmp_path, capsys, words, sentence):
         ),
         ({"effects": {"default": "maddpg"}}, "spread: effects needs default and quantity, not"),
         (
-            {"effects": {"default": "maddpg", "quantity": "test/own/x", "equal_time": "test/own/x"}},
-            "spread: equal_time of effects is test/own/x; it must be of curve/",
+            {"effects": {"default": "maddpg", "quantity": "test/own/x", "course": "test/own/x"}},
+            "spread: course of effects is test/own/x; it must be of curve/",
         ),
         (
             {"sweeps": [{"algos": ["maddpg"], "envs": ["HardSpread-v0"], "seeds": 3}], "published": {}},
@@ -595,12 +595,14 @@ def test_effects_at_equal_time():
     cells = {cell: [record(cell, seed, curve=curve) for seed in range(5)] for cell in ("default", "slow")}
     for own in cells["slow"]:
         own["taken"]["processor"] = 2.0
-    effects = {"default": "default", "quantity": "test/own/x", "equal_time": "curve/eval/x"}
+    effects = {"default": "default", "quantity": "test/own/x", "course": "curve/eval/x"}
     experiment = Experiment("e", "E", [{"algos": [*cells], "envs": ["W"]}], effects=effects)
     head, _, _, line = reproduce_report.effects_table(Results(experiment, 1.0, cells, {})).splitlines()
-    assert [part.strip() for part in head.split("|")[6:8]] == ["time", "difference at equal time (x)"]
+    headings = ["difference over the training", "so", "time", "difference at equal time"]
+    assert [part.strip() for part in head.split("|")[6:10]] == headings
     # evaluations 8 to 10 of 20 beside 18 to 20
-    assert [part.strip() for part in line.split("|")[6:8]] == ["× 2.00", "-10.00 [-10.00, -10.00]"]
+    numbers = ["0.00 [0.00, 0.00]", CANNOT_BE_TOLD, "× 2.00", "-10.00 [-10.00, -10.00]"]
+    assert [part.strip() for part in line.split("|")[6:10]] == numbers
 
 
 def test_a_curve_between_two_shares_of_the_training():

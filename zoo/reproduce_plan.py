@@ -317,11 +317,11 @@ def _check_effects(experiment: Experiment) -> None:
     :raises ValueError: if effects cannot be told
     """
     name, effects = experiment.name, experiment.effects
-    if effects and effects.keys() - {"equal_time"} != {"default", "quantity"}:
+    if effects and effects.keys() - {"course"} != {"default", "quantity"}:
         raise ValueError(f"{name}: effects needs default and quantity, not {in_one_line(effects)}")
-    late = effects.get("equal_time", "curve/")
-    if not late.startswith("curve/"):
-        raise ValueError(f"{name}: equal_time of effects is {late}; it must be of curve/…")
+    course = effects.get("course", "curve/")
+    if not course.startswith("curve/"):
+        raise ValueError(f"{name}: course of effects is {course}; it must be of curve/…")
 
 
 def _check_panel(name: str, panel: Mapping[str, Any]) -> None:

@@ -371,7 +371,7 @@ def effects_table(results: Results) -> str:
     if not len(base):
         return f"*The default, {default}, has not been measured yet.*"
     head = ["", described(of.rpartition("/")[2]), "difference to the default", "smallest that could be shown", "so"]
-    late = results.experiment.effects.get("equal_time")
+    course = results.experiment.effects.get("course")
     rows = []
     for cell, records in results.cells.items():
         values = results.values(cell, of)
@@ -379,11 +379,11 @@ def effects_table(results: Results) -> str:
         difference = difference_between(values, base)
         line = [label_of(records[0]), in_words_or_none(iqm_of(values), places)]
         line += [""] * 3 if cell == default else _effect(values, base, difference, places)
-        if late:
-            line += ["", ""] if cell == default else _at_equal_time(results, cell, default, late, places)
+        if course:
+            line += [""] * 4 if cell == default else _over_the_training(results, cell, default, course, places)
         rows.append((np.inf if cell == default else abs(np.nan_to_num(difference.mean)), [*line, str(len(values))]))
-    if late:
-        head += ["time", f"difference at equal time ({described(late.rpartition('/')[2])})"]
+    if course:
+        head += ["difference over the training", "so", "time", "difference at equal time"]
     return as_markdown([[*head, "seeds"], *(line for _, line in sorted(rows, key=lambda row: -row[0]))])
 
 
@@ -397,17 +397,28 @@ def _effect(values: np.ndarray, base: np.ndarray, difference: Interval, places: 
     if np.isnan(difference.mean):
         return [NOT_A_NUMBER, "", CANNOT_BE_TOLD]
     least = smallest_difference(values, base)
-    word = word_for(difference, 0.0, min(len(values), len(base)))
-    so = {HOLDS: "better", HOLDS_NOT: "worse"}.get(word, CANNOT_BE_TOLD)
+    so = better_or_worse(difference, min(len(values), len(base)))
     return [shown(difference, places), "" if np.isnan(least) else f"{least:.{places}f}", so]
 
 
-def _at_equal_time(results: Results, cell: str, default: str, of: str, places: int) -> list[str]:
-    """How many times the default's time a cell takes, and the difference when the slower one has had the other one's time."""
+def better_or_worse(difference: Interval, n_seeds: int) -> str:
+    """What a difference says, see :func:`word_for`."""
+    return {HOLDS: "better", HOLDS_NOT: "worse"}.get(word_for(difference, 0.0, n_seeds), CANNOT_BE_TOLD)
+
+
+def _over_the_training(results: Results, cell: str, default: str, of: str, places: int) -> list[str]:
+    """
+    The difference of the means over the training and what follows, how many times the default's time a cell takes, and the
+    difference when the slower one has had the other one's time.
+    """
+    whole, base = (results.values(name, of) for name in (cell, default))
+    difference = difference_between(whole, base)
+    so = better_or_worse(difference, min(len(whole), len(base)))
     times = {name: results.processor_time(name) for name in (cell, default)}
     until = {name: min(times.values()) / time for name, time in times.items()}
-    values, base = (results.values(name, of, until[name] - EQUAL_TIME, until[name]) for name in (cell, default))
-    return [f"× {times[cell] / times[default]:.2f}", in_words_or_none(difference_between(values, base), places)]
+    late = difference_between(*(results.values(name, of, until[name] - EQUAL_TIME, until[name]) for name in (cell, default)))
+    time = f"× {times[cell] / times[default]:.2f}"
+    return [in_words_or_none(difference, places), so, time, in_words_or_none(late, places)]
 
 
 def claims_table(claims: Sequence[Claim], results: Mapping[str, Results]) -> str:
