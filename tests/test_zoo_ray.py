@@ -87,6 +87,20 @@ def test_ray_tells_how_tasks_ended_and_carries_on_when_its_worker_dies(tmp_path,
     assert some.idle
 
 
+def test_a_stop_is_heard_where_ctrl_c_is_ignored(tmp_path, task, ray_workers):  # noqa: F811
+    """A script's commands in the background ignore SIGINT, and so does all that they start."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        some = ray_workers(1)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    some.submit(task("runs", "wait"))
+    some.ended(0)
+    wait_for(lambda: (tmp_path / "runs.log").exists() and "started" in (tmp_path / "runs.log").read_text())
+    some.stop()
+    assert (tmp_path / "saved").read_text() == "runs"
+
+
 def test_a_machine_that_does_not_see_the_sweep_is_named(tmp_path, task, monkeypatch):  # noqa: F811
     monkeypatch.setattr(workers, "PATIENCE", 0.2)
     hidden = workers.Task("hidden", task("a", "0").words, str(tmp_path / "log"), str(tmp_path), (str(tmp_path / "sweep.yml"),))

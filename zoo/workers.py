@@ -300,6 +300,7 @@ def carry_out(task: Task, threads: int) -> int | str:
     :param threads: see :class:`Attempt`
     :return: exit status, or what is wrong with this machine
     """
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # Ray cancels by it; what a script begins may ignore it
     for path in (*task.needs, task.folder, task.words[0]):
         if not appears(Path(path)):
             return (
