@@ -251,6 +251,10 @@ def test_a_batch_of_actions_of_the_wrong_shape():
     ("settings", "message"),
     [
         ({"replay_buffer_kwargs": {"n_fold": 3}}, 'unknown setting in replay_buffer_kwargs "n_fold"; did you mean "n_folds"?'),
+        (
+            {"policy_kwargs": {"optimizer_kwargs": {"epss": 1}}},
+            'unknown setting in optimizer_kwargs "epss"; did you mean "eps"?',
+        ),
         ({"policy_kwargs": {"net_ach": [8]}}, 'unknown setting in policy_kwargs "net_ach"; did you mean "net_arch"?'),
         ({"gamma": "0.9"}, "gamma must be a number, got '0.9'"),
         ({"learning_starts": "a"}, "learning_starts must be a whole number"),

@@ -77,6 +77,9 @@ def test_patterns_checkpoints_and_best_models_are_found(tmp_path, runs):
     assert list(best["players"]["sheep"]) == ["maddpg_1 best"]
     assert (best["rows"], best["metric"]) == ("sheep", "won_sheep")
 
+    below = play(tmp_path, "--team", f"wolf={runs}", "sheep=graze")
+    assert {"maddpg_1", "maddpg_2"} <= {*below["players"]["wolf"]}
+
     found = play(tmp_path, "--team", f"wolf={runs / '*_[12]'}", f"wolf={run / 'rl_model_*.zip'}", "sheep=graze,flee")
     assert list(found["players"]["wolf"]) == ["maddpg_1", "maddpg_2", "maddpg_1@40", "maddpg_1@80"]
     assert list(found["players"]["sheep"]) == ["graze+flee"]
@@ -149,7 +152,6 @@ REFUSED = [
     ("--team wolf=nowhere.zip", "there is no file nowhere.zip to take a player of"),
     ("--team wolf=no*.zip", 'no file and no folder matches "no*.zip"'),
     ("--team wolf={runs}/nothing/", "there is no file {runs}/nothing/ to take a player of"),
-    ("--team wolf={runs}/", "{runs} is no folder of a run of zoo/train.py"),
     ("--team wolf={tmp}/damaged.zip", "damaged"),
     ("--team wolf={tmp}/other.zip", "is for another world: 1 wolf"),
     ("--team sheep={runs}/Grassland-v0_3", "plays wolf; wanted is a player of sheep"),

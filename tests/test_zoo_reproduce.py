@@ -5,6 +5,7 @@ and that tables, verdicts and pictures say what the records hold.
 
 import json
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from zoo import pages, reproduce, reproduce_report, reproduce_run, train
 from zoo.reproduce_plan import EXPERIMENTS, OF_THE_CURRICULUM, Claim, Experiment, planned, read_experiments
 from zoo.reproduce_records import is_there, read_record
 from zoo.reproduce_report import CANNOT_BE_TOLD, HOLDS, HOLDS_NOT, NOT_A_NUMBER, Results, judged, word_for
-from zoo.series import tensorboard_series
+from zoo.series import Series, tensorboard_series
 from zoo.statistics import difference_with_interval, smallest_difference
 
 SMALL = {"n_envs": 2, "learning_starts": 20, "batch_size": 8, "buffer_size": 200}
@@ -258,6 +259,10 @@ def test_a_damaged_record_is_told(made, tmp_path):
         ("[]", "is no record of zoo/reproduce.py"),
         ('{"identity": 3}', "is no record of zoo/reproduce.py"),
         (with_other(lambda record: record.pop("taken")), "seed_0.json is damaged: its taken is missing, or of another type"),
+        (
+            with_other(lambda record: record["taken"].update(processor=0)),
+            "its taken.processor is 0; it must be above 0",
+        ),
         (with_other(lambda record: record["identity"].pop("cell")), "is damaged: its identity.cell is missing, or of"),
         (with_other(lambda record: record["test"]["tests"].update(own=[])), "is damaged: its test.tests is missing, or of"),
         (
@@ -443,6 +448,11 @@ def test_bad_words(tmp_path, capsys, words, sentence):
             "spread: a sweep has the worlds HardSpread-v0 and Grassland-v0; give each",
         ),
         ({"effects": {"default": "maddpg"}}, "spread: effects needs default and quantity, not"),
+        ({"effects": {"defualt": "maddpg"}}, 'unknown key of the effects of spread "defualt"; did you mean "default"?'),
+        (
+            {"sweeps": [{"algos": ["maddpg"], "envs": ["HardSpread-v0"], "train": {"eval-freq": -1}}], "published": {}},
+            "spread: maddpg is never evaluated (eval-freq -1), and curve/eval/cover_rate is to be shown",
+        ),
         (
             {"effects": {"default": "maddpg", "quantity": "test/own/x", "course": "test/own/x"}},
             "spread: course of effects is test/own/x; it must be of curve/",
@@ -681,7 +691,8 @@ def test_records_that_differ_are_not_shown_together(tmp_path):
 def test_scripted_policies_are_shown_that_met_the_same_episodes(tmp_path):
     written(tmp_path, record("maddpg", 0))
     scripted = record("maddpg", 0, mean=5.0)
-    scripted["identity"] = {"experiment": "e", "players": {"agent": "random"}, "test_episodes": 2}
+    world = {"env_id": "W", "env_kwargs": None, "env_wrapper": None}
+    scripted["identity"] = {"experiment": "e", "world": world, "players": {"agent": "random"}, "test_episodes": 2}
     written(tmp_path, scripted, ONE.scripted_record(tmp_path, {"agent": "random"}, 3))
     assert reproduce_report.read_results(ONE, tmp_path).scripted == {}
     path = written(tmp_path, scripted, ONE.scripted_record(tmp_path, {"agent": "random"}, 2))
@@ -690,6 +701,49 @@ def test_scripted_policies_are_shown_that_met_the_same_episodes(tmp_path):
     written(tmp_path, scripted, path)
     with pytest.raises(ValueError, match=f"the record {path} is of a test with the seeds 8 to 9, and"):
         reproduce_report.read_results(ONE, tmp_path)
+    world["env_kwargs"] = {"max_steps": 5}
+    written(tmp_path, scripted, path)
+    with pytest.raises(ValueError, match=rf"the record {path} is of the world \{{env_id: W, env_kwargs: \{{max_steps: 5\}}"):
+        reproduce_report.read_results(ONE, tmp_path)
+
+
+def test_runs_whose_curriculum_logged_nothing_cost_the_page_nothing(tmp_path):
+    of = "curve/curriculum/teacher_loss_in_fold"
+    for seed in range(5):
+        told = record("a", seed)
+        if seed:
+            told["curve"]["curriculum"] = {"steps": [10], "episodes": [1], "teacher_loss_in_fold": [0.5]}
+        written(tmp_path, told)
+        written(tmp_path, record("b", seed, 1.0))
+    panels = [{"title": "", "estimates": "test/own/x"}, {"title": "", "estimates": of}]
+    experiment = Experiment("e", "E", [{"algos": ["a", "b"], "envs": ["W"]}], columns={"of": of}, pictures={"p": panels})
+    told = reproduce_report.read_results(experiment, tmp_path)
+    assert np.isnan(told.values("a", of)[0]) and told.values("a", of)[1] == 0.5
+    assert f"| MADDPG | {NOT_A_NUMBER} | 5 |" in reproduce_report.results_table(told)
+    assert reproduce_report.cells_of_pictures(told) == {}
+    with pytest.raises(ValueError, match="have no curve/eval/y"):
+        told.values("a", "curve/eval/y")
+
+
+def test_what_a_short_curriculum_has_logged(monkeypatch):
+    def series(*steps):
+        return Series(np.array(steps), np.arange(len(steps), dtype=float), np.zeros(len(steps)))
+
+    logged = {
+        "curriculum/unscored": series(10, 20),
+        "curriculum/teacher_loss_in_fold": series(10, 20, 30),
+        "curriculum/rank_correlation_with_last": series(30),
+    }
+    monkeypatch.setattr(reproduce_run, "tensorboard_series", lambda _: logged)
+    at = np.array([15, 40])
+    during, values = reproduce_run.curriculum_of(SimpleNamespace(tensorboard_folder=""), at)
+    assert during.tolist() == [15, 40] and {name: own.tolist() for name, own in values.items()} == {
+        "teacher_loss_in_fold": [0, 1]
+    }
+    for name in ("unscored", "teacher_loss_in_fold"):
+        del logged[f"curriculum/{name}"]
+        assert reproduce_run.curriculum_of(SimpleNamespace(tensorboard_folder=""), at)[1] == {}
+        logged["curriculum/unscored"] = series(10)
 
 
 def test_cells_that_the_experiment_has_no_more_are_left_out(tmp_path, capsys):

@@ -90,8 +90,8 @@ def test_the_latest_run_is_picked_unless_its_number_is_given(logs):
 
 
 PICKED_WRONGLY = [
-    ({"algo": "madpg"}, 'unknown algorithm "madpg"; did you mean "maddpg"?'),
-    ({"env_id": "Graslnd-v0"}, 'unknown environment "Graslnd-v0"; did you mean "Grassland-v0"?'),
+    ({"algo": "madpg"}, 'unknown algorithm of the runs "madpg"; did you mean "maddpg"?'),
+    ({"env_id": "Graslnd-v0"}, 'unknown environment of the runs "Graslnd-v0"; did you mean "Grassland-v0"?'),
     ({"algo": "kfcv_maddpg", "exp_id": 9}, "fits; there are .*HardSpread-v0_1$"),
     ({"algo": "kfcv_maddpg", "env_id": "Grassland-v0"}, "fits; there are"),
 ]

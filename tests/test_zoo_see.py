@@ -377,8 +377,12 @@ def bad(tmp_path_factory, logs):
 
 REFUSED = [
     (evaluate, "-f {tmp}/nothing", "there is no run in {tmp}/nothing; train one with zoo/train.py"),
-    (evaluate, "-f {logs} --algo madpg", 'there is no run of it: unknown algorithm "madpg"; did you mean "maddpg"?'),
-    (evaluate, "-f {logs} --env Graslnd-v0", 'there is no run of it: unknown environment "Graslnd-v0"'),
+    (
+        evaluate,
+        "-f {logs} --algo madpg",
+        'there is no run of it: unknown algorithm of the runs "madpg"; did you mean "maddpg"?',
+    ),
+    (evaluate, "-f {logs} --env Graslnd-v0", 'there is no run of it: unknown environment of the runs "Graslnd-v0"'),
     (evaluate, "-f {logs} --exp-id 9", "no run in {logs} fits; there are"),
     (evaluate, "chase --env Graslnd-v0", 'unknown environment "Graslnd-v0"; did you mean "Grassland-v0"?'),
     (evaluate, "chase", "say with --env in which world chase is to play"),
@@ -386,6 +390,7 @@ REFUSED = [
     (evaluate, "{tmp}/alone.zip --env Grassland-v0 {world}", "nobody plays sheep beside alone: add --team sheep=random"),
     (evaluate, "chase --env Grassland-v0", "nobody plays sheep beside chase: add --team sheep=random"),
     (evaluate, "chaise --env Grassland-v0", 'unknown scripted policy of \'wolf\' "chaise"; did you mean "chase"?'),
+    (evaluate, "{one} --exp-id 2", "--exp-id picks a run of -f, and {one} is named; leave out the one or the other"),
     (evaluate, "{logs} --algo ddpg", "there is no run of ddpg below {logs}; there is "),
     (
         evaluate,

@@ -122,12 +122,13 @@ class Matches:
 
 def fit(arena: Arena, group: str, player: str, best: bool) -> list[str]:
     """
-    As :func:`found`; of what a pattern matches, only those that can play the group here. A note names the others.
+    As :func:`found`; of what a pattern or a folder of runs means, only those that can play the group here. A note names
+    the others.
 
     :raises FileFormatError: for a damaged file
     """
     players = found(player, group, best)
-    if not glob.has_magic(player):
+    if not glob.has_magic(player) and len(players) == 1:
         return players
     fitting = []
     for path in players:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.saving.files import is_path
 from zoo.run_folder import RunFolder, file_to_play
-from zoo.runs import Run, natural
+from zoo.runs import Run, natural, runs_below
 
 
 def parse_team(words: Sequence[str], known: Sequence[str], flag: str = "--team") -> dict[str, list[str]]:
@@ -50,7 +51,8 @@ def found(player: str, group: str, best: bool = False) -> list[str]:
         paths = sorted(glob.glob(player), key=natural)
         if not paths:
             raise ValueError(f'no file and no folder matches "{player}"')
-    return [str(file_to_play(path, group if best else None)) if is_named(path) else path for path in paths]
+    below = [str(run.folder.path) for path in paths for run in runs_below(path)] if all(map(os.path.isdir, paths)) else []
+    return [str(file_to_play(path, group if best else None)) if is_named(path) else path for path in below or paths]
 
 
 def run_of(word: str) -> Run | None:

@@ -171,6 +171,8 @@ def playing(args: argparse.Namespace, n_envs: int, drawn: bool = False) -> Playi
     :param drawn: whether they are to be drawn
     :raises ValueError: one sentence that says what is wrong
     """
+    if args.players and args.exp_id:
+        raise ValueError(f"--exp-id picks a run of -f, and {args.players[0]} is named; leave out the one or the other")
     words = [path for word in args.players for path in _expanded(word, args)]
     in_team = [word.partition("=")[2] for word in args.team]
     runs = [run for word in [*words, *in_team] if (run := run_of(word)) is not None]

@@ -51,9 +51,9 @@ from zoo.worlds import World
 
 DESCRIPTION = """\
 Train what the paper shows, measure it as the paper does, and write the page that compares them. Targets: table2, fig6, fig8,
-fig9, ablations, yardstick, tuned, single experiments of hyperparams/reproduce.yml, or all. Each run that has ended leaves a
-record of some kilobytes below <docs>/results/reproduce, and is never run again; the same command goes on with what is missing.
-Pictures and the tables of <docs>/reproduction.md are made of the records alone."""
+fig9, tuned, ablations, controls, readings, levers, yardstick, any experiment of hyperparams/reproduce.yml by its name, or
+all. Each run that has ended leaves a record of some kilobytes below <docs>/results/reproduce, and is never run again; the same
+command goes on with what is missing. Pictures and the tables of <docs>/reproduction.md are made of the records alone."""
 EXAMPLES = ("table2 --dry-run", "all --scale 0.1 --seeds 5 --workers 2", "fig8 fig9", "--report")
 
 
@@ -196,8 +196,11 @@ def _check_evaluations(record: PlannedRecord, arena: Arena, claims: Sequence[Cla
     if run.algo == "kfcv_maddpg":
         known.append(CURRICULUM)
     claimed = [claim.quantity for claim in claims if cell in (claim.cell, claim.than)]
+    never = not 0 < run.args.eval_freq <= run.hyperparams.n_timesteps
     for of in [*record.experiment.quantities_of(cell), *claimed]:
         kind, name, _ = of.split("/", 2)
+        if kind == "curve" and never:
+            raise ValueError(f"{cell} is never evaluated (eval-freq {run.args.eval_freq}), and {of} is to be shown")
         if kind == "curve" and name not in known:
             raise ValueError(unknown_name(f"evaluation of {cell}", name, known))
 

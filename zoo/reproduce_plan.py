@@ -59,6 +59,7 @@ EXPERIMENT_KEYS = {
     "effects": dict[str, str],
     "pictures": dict[str, list[dict[str, Any]]],
 }
+EFFECTS_KEYS = ("default", "quantity", "course")
 SIDES = ("lower", "higher")
 TABLES = ("claims", "runs")  # of the page, beside those of the experiments
 PANELS = ("curve", "scatter", "estimates", "rivals")
@@ -317,6 +318,9 @@ def _check_effects(experiment: Experiment) -> None:
     :raises ValueError: if effects cannot be told
     """
     name, effects = experiment.name, experiment.effects
+    for key in effects:
+        if key not in EFFECTS_KEYS:
+            raise ValueError(unknown_name(f"key of the effects of {name}", key, EFFECTS_KEYS))
     if effects and effects.keys() - {"course"} != {"default", "quantity"}:
         raise ValueError(f"{name}: effects needs default and quantity, not {in_one_line(effects)}")
     course = effects.get("course", "curve/")

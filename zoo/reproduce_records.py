@@ -78,7 +78,9 @@ def _whole(record: Record) -> Record:
     if settings.get("teams") is not None:
         for team, own in _parts("identity.settings.", settings, {"teams": TEAMS})["teams"].items():
             _parts(f"identity.settings.teams.{team}.", own, {"algo": str})
-    _parts("taken.", record["taken"], dict.fromkeys(("wall", "processor", "memory"), float))
+    for name, taken in _parts("taken.", record["taken"], dict.fromkeys(("wall", "processor", "memory"), float)).items():
+        if not taken > 0:
+            raise ValueError(f"its taken.{name} is {taken:g}; it must be above 0")
     for name, curve in whole["curve"].items():
         times = _parts(f"curve.{name}.", curve, dict.fromkeys(("steps", "episodes"), list[float]))["steps"]
         if not times or {len(values) for values in curve.values()} != {len(times)}:

@@ -20,7 +20,7 @@ from zoo.hyperparams import CO_TRAINING
 from zoo.match_results import as_markdown, described, shown, write_text
 from zoo.pages import filled
 from zoo.plots import draw_estimates, draw_intervals, draw_legend, draw_references, line_styles, new_figure, save_figure
-from zoo.reproduce_plan import Claim, Experiment
+from zoo.reproduce_plan import CURRICULUM, Claim, Experiment
 from zoo.reproduce_records import Record, differences, read_record
 from zoo.run_groups import algo_label, note
 from zoo.runs import natural
@@ -129,7 +129,7 @@ def _read_cell(experiment: Experiment, scale: float, cell: str, paths: Sequence[
                 f"the record {path} was measured with {name} {in_one_line(theirs)}, and {paths[0].name} beside it with "
                 f"{in_one_line(ours)}; remove the one that is not wanted"
             )
-        for of in experiment.quantities_of(cell):
+        for of in filter(is_measured, experiment.quantities_of(cell)):
             try:
                 quantity(record, of)
             except ValueError:
@@ -160,11 +160,26 @@ def _read_scripted(
     scripted = {label: read_record(path) for label, path in names.items() if path.is_file()}
     tested += [(names[label], record) for label, record in scripted.items()]
     (first, shown_first), *others = tested
+    for label, record in scripted.items():
+        ours, theirs = world_of(shown_first), world_of(record)
+        if ours != theirs:
+            raise ValueError(
+                f"the record {names[label]} is of the world {in_one_line(theirs)}, and {first} of {in_one_line(ours)}"
+            )
     for path, record in others:
         ours, theirs = shown_first["test"]["seeds"], record["test"]["seeds"]
         if ours != theirs:
             raise ValueError(f"the record {path} is of a test with the seeds {_span(theirs)}, and {first} of {_span(ours)}")
     return scripted
+
+
+def world_of(record: Record) -> dict[str, Any]:
+    """Where a run was tested, or scripted policies played."""
+    identity = record["identity"]
+    if "players" in identity:
+        return identity.get("world", {})
+    settings = identity["settings"]
+    return {"env_id": identity["env"], **{name: settings.get(name) for name in ("env_kwargs", "env_wrapper")}}
 
 
 def _span(seeds: Sequence[int]) -> str:
@@ -210,7 +225,20 @@ def quantity(record: Record, of: Quantity, since: float = 0.0, until: float = 1.
         values = np.array(curve[metric], dtype=float)[: last + 1][steps[: last + 1] >= since * n_timesteps]
         return float(np.mean(values)) if len(values) else np.nan
     except KeyError:
+        if not is_measured(of):
+            return np.nan
         raise ValueError(f"the records of {record['identity']['experiment']} have no {of}") from None
+
+
+def is_measured(of: str) -> bool:
+    """Whether every run has a quantity: a short one may end before its curriculum has logged all."""
+    return not of.startswith(f"curve/{CURRICULUM}/")
+
+
+def has(record: Record, of: str) -> bool:
+    """Whether a run has a quantity that may not be there."""
+    _, name, metric = of.split("/", 2)
+    return is_measured(of) or metric in record["curve"].get(name, {})
 
 
 def _number(value: float | None) -> float:
@@ -579,10 +607,17 @@ def picture_name(name: str) -> str:
 
 def cells_of_pictures(results: Results) -> dict[str, list[list[str]]]:
     """The pictures of which each panel has something to show: name → the cells in each panel."""
-    found = {
-        name: [[cell for cell in panel.get("cells", results.cells) if cell in results.cells] for panel in panels]
-        for name, panels in results.experiment.pictures.items()
-    }
+    found = {}
+    for name, panels in results.experiment.pictures.items():
+        shown = [(panel[kind], panel.get("cells", results.cells)) for panel in panels for kind in PANELS if kind in panel]
+        found[name] = [
+            [
+                cell
+                for cell in cells
+                if all(has(record, of) for record in results.cells.get(cell, ())) and cell in results.cells
+            ]
+            for of, cells in shown
+        ]
     return {name: cells for name, cells in found.items() if all(cells)}
 
 

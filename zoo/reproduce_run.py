@@ -169,7 +169,7 @@ def curves_of(run: Run) -> dict[str, dict[str, list[float]]]:
         found[name] = curve(course, steps, {METRIC_NAMES.get(key, key): own.mean(axis=1) for key, own in arrays.items()})
         if name == "eval":
             during, values = curriculum_of(run, steps)
-            if values:
+            if len(during) and values:
                 found[CURRICULUM] = curve(course, during, values)
     return found
 
@@ -199,10 +199,12 @@ def curriculum_of(run: Run, at: np.ndarray) -> tuple[np.ndarray, dict[str, np.nd
     :return: those of these times since the last of which something was logged, and name → the mean of what was
     """
     logged = tensorboard_series(run.tensorboard_folder)
-    series = {name: logged[f"curriculum/{name}"] for name in OF_THE_CURRICULUM if f"curriculum/{name}" in logged}
-    if "curriculum/unscored" not in logged or not series:  # logged while transitions have scores, and draws go by them
+    if "curriculum/unscored" not in logged:
         return at[:0], {}
-    together = reduce(np.intersect1d, [logged["curriculum/unscored"].steps, *(own.steps for own in series.values())])
+    during = logged["curriculum/unscored"].steps  # while transitions have scores, and draws go by them
+    named = {name: logged.get(f"curriculum/{name}") for name in OF_THE_CURRICULUM}
+    series = {name: own for name, own in named.items() if own is not None and np.isin(own.steps, during).any()}
+    together = reduce(np.intersect1d, [during, *(own.steps for own in series.values())])
     until = np.searchsorted(at, together)
     times = np.unique(until[until < len(at)])
     means = {}

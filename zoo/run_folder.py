@@ -312,7 +312,9 @@ def read_map(path: Path) -> dict[str, Any]:
     :raises ValueError: if it is missing, no YAML, has equal keys, or is something else
     """
     try:
-        content = UniqueKeys(path.read_text(encoding="utf-8")).get_single_data()
+        loader = UniqueKeys(path.read_text(encoding="utf-8"))
+        loader.name = path.name  # for messages
+        content = loader.get_single_data()
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:

@@ -193,4 +193,4 @@ def natural(text: str) -> list[tuple[int, str]]:
 
 def _require(kind: str, name: str | None, known: Sequence[str]) -> None:
     if name is not None and name not in known:
-        raise ValueError(f"there is no run of it: {unknown_name(kind, name, set(known))}")
+        raise ValueError(f"there is no run of it: {unknown_name(f'{kind} of the runs', name, set(known))}")

@@ -74,9 +74,16 @@ def evaluations(folder: str | Path, name: str = "eval") -> dict[str, np.ndarray]
         )
     try:
         with np.load(files[name], allow_pickle=False) as arrays:
-            return {key: arrays[key] for key in arrays.files}
+            found = {key: arrays[key] for key in arrays.files}
     except (OSError, EOFError, ValueError, TypeError, RuntimeError, BadZipFile) as error:
         raise ValueError(f"{files[name]} cannot be read: {error}") from None
+    steps = found.get("timesteps", np.empty(0))
+    if steps.ndim != 1 or steps.dtype.kind not in "iu" or (np.diff(steps) <= 0).any():
+        raise ValueError(f"{files[name]} is damaged: its timesteps are no ascending whole numbers")
+    for key, values in found.items():
+        if key != "timesteps" and (values.ndim != 2 or values.dtype.kind not in "iufb" or len(values) != len(steps)):
+            raise ValueError(f"{files[name]} is damaged: its {key} are not the numbers of {len(steps)} evaluations")
+    return found
 
 
 @dataclass(frozen=True)

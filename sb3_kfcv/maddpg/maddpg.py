@@ -253,6 +253,8 @@ class MADDPG(JointAlgorithm):
         if isinstance(activation, str | nn.Module):
             raise ValueError(f"activation_fn must be a class, such as torch.nn.Tanh; got {activation!r}")
         require_parameters("policy_kwargs", self.policy_kwargs, self.policy_class)
+        optimizer = self.policy_kwargs.get("optimizer_class", th.optim.Adam)
+        require_parameters("optimizer_kwargs", self.policy_kwargs.get("optimizer_kwargs") or {}, optimizer)
         require_parameters("replay_buffer_kwargs", self.replay_buffer_kwargs, self.replay_buffer_class)  # type: ignore[arg-type]
         if isinstance(self.learning_rate, str):
             schedule_of(self.learning_rate)
