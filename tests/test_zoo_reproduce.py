@@ -13,10 +13,12 @@ import yaml
 from test_zoo import ROOT
 
 from sb3_kfcv.common.evaluation import Interval
+from sb3_kfcv.matches.arena import BLOCK
 from zoo import pages, reproduce, reproduce_report, reproduce_run, train
 from zoo.reproduce_plan import EXPERIMENTS, OF_THE_CURRICULUM, Claim, Experiment, planned, read_experiments
 from zoo.reproduce_records import is_there, read_record
 from zoo.reproduce_report import CANNOT_BE_TOLD, HOLDS, HOLDS_NOT, NOT_A_NUMBER, Results, judged, word_for
+from zoo.reproduce_run import as_trained
 from zoo.series import Series, tensorboard_series
 from zoo.statistics import difference_with_interval, smallest_difference
 
@@ -320,6 +322,28 @@ def test_a_run_does_not_go_on_with_another_test(tmp_path):
         ValueError, match=r"this run was measured with test_episodes 2, and is now to have 3; .* remove its folder"
     ):
         measure.set_state({**then, "test": {"after": 190}})
+
+
+def test_models_of_normalised_observations_normalise_what_they_see_in_the_test(tmp_path, monkeypatch):
+    sweep = TINY["experiments"]["spread"]["sweeps"][0]
+    write(
+        tmp_path,
+        changed(published={}, sweeps=[{**sweep, "algos": ["maddpg"], "settings": {"": {**SMALL, "normalize": True}}}]),
+    )
+    (own,) = wanted(tmp_path)
+    models = []
+    monkeypatch.setattr(reproduce_run, "as_trained", lambda model: models.append(model) or as_trained(model))
+    assert reproduce_run.main([str(own.begin(keep_runs=False))]) == 0
+    assert read_record(own.path)["test"]["tests"]["own"]["mean"]["return_agent"] < 0
+
+    (model,) = models
+    rows = np.random.default_rng(0).normal(size=(BLOCK, model.observation_space.shape[0])).astype(np.float32)
+    seen = model.get_vec_normalize_env().obs_rms
+    assert np.ptp(seen.var) > 0.1
+    by_hand = np.clip((rows - seen.mean) / np.sqrt(seen.var + 1e-8), -10, 10).astype(np.float32)
+    expected = model.predict(by_hand, deterministic=True)[0]
+    np.testing.assert_allclose(as_trained(model).predict(rows)[0], expected, atol=1e-6)
+    assert not np.allclose(model.predict(rows, deterministic=True)[0], expected, atol=1e-3)
 
 
 def test_a_training_that_is_too_short_for_an_episode_has_none_in_its_curve(tmp_path):

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_kfcv.common.actors import ActorPolicy
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.naming import unknown_name
@@ -114,18 +115,16 @@ class Cast:
 
 class Normalized:
     """
-    A saved model that was trained on normalised observations: it normalises what it sees as it did then.
+    A model that learns from normalised observations: it normalises what it sees as in its training.
 
-    :param path: of the model or checkpoint
-    :param group: whom it plays
-    :param env: worlds like those it is to play in
+    :param policy: its actors
+    :param statistics: what normalises
     """
 
-    def __init__(self, path: str, group: str, env: VecEnv) -> None:
-        policy = load_player(path, group)
+    def __init__(self, policy: ActorPolicy, statistics: VecNormalize) -> None:
         self.layout, self.agents = policy.layout, policy.agents
         self._actors = FrozenActors(policy)
-        self._statistics = load_normalization(path, env, training=False)
+        self._statistics = statistics
 
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -364,7 +363,8 @@ def _side(arena: Arena, group: str, player: Any) -> Side:
         with open_archive(player, *PLAYER_KINDS) as archive:
             normalized = "normalization" in archive
         if normalized:
-            return arena.side(group, Normalized(player, group, arena.env))
+            own = Normalized(load_player(player, group), load_normalization(player, arena.env, training=False))
+            return arena.side(group, own)
     return arena.side(group, player)
 
 

@@ -436,8 +436,6 @@ def planned(
                 path = experiment.records(records, scale) / cell / f"seed_{run.seed}.json"
                 if path in found:
                     raise ValueError(f"two sweeps have the cell {cell}; give one of them settings with another name")
-                if run.hyperparams.normalize is not None:
-                    raise ValueError(f"{run.name}: models that see normalised observations cannot be tested here")
                 named = replace(run, setting="/".join(filter(None, (experiment.name, run.setting))))
                 n_episodes = n_test_episodes or experiment.test_episodes
                 found[path] = PlannedRecord(experiment, scale, named, cell, path, n_episodes)

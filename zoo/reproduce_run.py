@@ -31,6 +31,7 @@ from sb3_kfcv.saving.files import atomic_write
 from zoo import sweep_run, train
 from zoo.command_line import BAD_INPUT, REFUSALS, refused, start
 from zoo.match_results import plain
+from zoo.playing import Normalized
 from zoo.reproduce_plan import CURRICULUM, OF_THE_CURRICULUM, LineUp
 from zoo.reproduce_records import IN_A_RUN, measured_file, read_measured, record_in_the_run, require_same, tested
 from zoo.run_groups import METRIC_NAMES
@@ -105,15 +106,20 @@ class Measure(BaseCallback):
 
     def _on_step(self) -> bool:
         if self.test is None and self.num_timesteps >= TEST_AT * self.model._total_timesteps:
-            groups = {
-                name: {**dict.fromkeys(_groups_of(self.model), self.model), **own} for name, own in self.line_ups.items()
-            }
+            player = as_trained(self.model)
+            groups = {name: {**dict.fromkeys(_groups_of(self.model), player), **own} for name, own in self.line_ups.items()}
             self.test = {"after": self.num_timesteps, **played(self.world, groups, self.n_episodes)}
         return True
 
     def _on_training_end(self) -> None:
         with atomic_write(self.path) as file:
             file.write(json.dumps(self.get_state()).encode())
+
+
+def as_trained(model: Any) -> Any:
+    """A model as one that plays in worlds whose observations are as they are."""
+    statistics = model.get_vec_normalize_env()
+    return model if statistics is None else Normalized(model.policy, statistics)
 
 
 def _groups_of(model: Any) -> Sequence[str]:
