@@ -26,10 +26,13 @@ from zoo.run_groups import algo_label, note
 from zoo.runs import natural
 from zoo.statistics import (
     ENOUGH_RUNS,
+    LEVEL,
     difference_with_interval,
+    improvement,
     improvement_with_interval,
     iqm_curve,
     iqm_with_interval,
+    rank_test,
     smallest_difference,
 )
 from zoo.sweep_plan import in_one_line
@@ -305,8 +308,7 @@ class Verdict:
 
 def judged(claim: Claim, results: Results) -> Verdict:
     """
-    Hold a claim against the records. Of two cells: the interval of P(improvement) is above one half, or below, or has it
-    within; of a cell and a number: the interval of the IQM likewise. Of fewer than ``ENOUGH_RUNS`` seeds nothing can be told.
+    Hold a claim against the records, see :func:`ahead` for two cells and :func:`above` for a cell and a number.
 
     :param claim: what is claimed
     :param results: of its experiment
@@ -315,7 +317,7 @@ def judged(claim: Claim, results: Results) -> Verdict:
     sign = -1 if claim.lower else 1
     if isinstance(claim.than, str):
         others = results.values(claim.than, claim.quantity, claim.since)
-        n_seeds, border = min(len(values), len(others)), 0.5
+        n_seeds = min(len(values), len(others))
         if not n_seeds:
             return Verdict(claim, "", 0, CANNOT_BE_TOLD)
         if np.isnan([*values, *others]).any():
@@ -323,31 +325,41 @@ def judged(claim: Claim, results: Results) -> Verdict:
         interval = improvement_with_interval({"": sign * values}, {"": sign * others}, _rng())
         places = decimals(np.concatenate([values, others]))
         sides = f"{shown(iqm_of(values), places)} against {shown(iqm_of(others), places)}"
-        numbers = f"{sides}; P {shown(interval)}"
+        numbers, so = f"{sides}; P {shown(interval)}", ahead(sign * values, sign * others)
     else:
-        n_seeds, border = len(values), claim.than
+        n_seeds = len(values)
         if not n_seeds:
             return Verdict(claim, "", 0, CANNOT_BE_TOLD)
         interval = iqm_of(values)
-        numbers = in_words_or_none(interval, 2)
-        if claim.lower:
-            interval, border = Interval(-interval.mean, -interval.high, -interval.low), -border
-    return Verdict(claim, numbers, n_seeds, word_for(interval, border, n_seeds))
+        numbers, so = in_words_or_none(interval, 2), above(iqm_of(sign * values), sign * claim.than, n_seeds)
+    return Verdict(claim, numbers, n_seeds, {True: HOLDS, False: HOLDS_NOT, None: CANNOT_BE_TOLD}[so])
 
 
-def word_for(interval: Interval, border: float, n_seeds: int) -> str:
+def ahead(values: np.ndarray, others: np.ndarray) -> bool | None:
     """
-    The rule of all verdicts.
+    The rule for two cells: whether runs of the one are better than runs of the other, by a rank test of ``LEVEL``.
+
+    :param values: of the one, more is better (runs,)
+    :param others: of the other (runs,)
+    :return: ``None`` if it cannot be told: also of fewer than ``ENOUGH_RUNS`` runs of either
+    """
+    if min(len(values), len(others)) < ENOUGH_RUNS or np.isnan([*values, *others]).any():
+        return None
+    return improvement({"": values}, {"": others}) > 0.5 if rank_test(values, others) < LEVEL else None
+
+
+def above(interval: Interval, border: float, n_seeds: int) -> bool | None:
+    """
+    The rule for a cell and a number: whether the whole interval is on one side of the number.
 
     :param interval: of what should be high
     :param border: that it should be above
     :param n_seeds: from which it was found
+    :return: ``None`` if it cannot be told: also from fewer than ``ENOUGH_RUNS`` seeds
     """
-    if n_seeds < ENOUGH_RUNS:
-        return CANNOT_BE_TOLD
-    if interval.low > border:
-        return HOLDS
-    return HOLDS_NOT if interval.high < border else CANNOT_BE_TOLD
+    if n_seeds < ENOUGH_RUNS or not (interval.low > border or interval.high < border):
+        return None
+    return interval.low > border
 
 
 # ---- tables: lines of texts, the head first
@@ -425,13 +437,13 @@ def _effect(values: np.ndarray, base: np.ndarray, difference: Interval, places: 
     if np.isnan(difference.mean):
         return [NOT_A_NUMBER, "", CANNOT_BE_TOLD]
     least = smallest_difference(values, base)
-    so = better_or_worse(difference, min(len(values), len(base)))
+    so = better_or_worse(values, base)
     return [shown(difference, places), "" if np.isnan(least) else f"{least:.{places}f}", so]
 
 
-def better_or_worse(difference: Interval, n_seeds: int) -> str:
-    """What a difference says, see :func:`word_for`."""
-    return {HOLDS: "better", HOLDS_NOT: "worse"}.get(word_for(difference, 0.0, n_seeds), CANNOT_BE_TOLD)
+def better_or_worse(values: np.ndarray, base: np.ndarray) -> str:
+    """What a difference says, see :func:`ahead`."""
+    return {True: "better", False: "worse", None: CANNOT_BE_TOLD}[ahead(values, base)]
 
 
 def _over_the_training(results: Results, cell: str, default: str, of: str, places: int) -> list[str]:
@@ -441,7 +453,7 @@ def _over_the_training(results: Results, cell: str, default: str, of: str, place
     """
     whole, base = (results.values(name, of) for name in (cell, default))
     difference = difference_between(whole, base)
-    so = better_or_worse(difference, min(len(whole), len(base)))
+    so = better_or_worse(whole, base)
     times = {name: results.processor_time(name) for name in (cell, default)}
     until = {name: min(times.values()) / time for name, time in times.items()}
     late = difference_between(*(results.values(name, of, until[name] - EQUAL_TIME, until[name]) for name in (cell, default)))

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from scipy.special import stdtrit
-from scipy.stats import trim_mean
+from scipy.stats import mannwhitneyu, trim_mean
 
 from sb3_kfcv.common.evaluation import CONFIDENCE, Interval
 
@@ -22,6 +22,9 @@ N_RESAMPLES = 5_000
 
 # Of fewer runs an interval says little: too few different samples can be drawn from them.
 ENOUGH_RUNS = 5
+
+# Runs of two that are alike are taken for unlike with this probability.
+LEVEL = 1 - CONFIDENCE
 
 # A difference that is there should be shown with this probability.
 POWER = 0.8
@@ -130,6 +133,20 @@ def difference_with_interval(
     """
     draws = iqm(resampled(values, rng, n_resamples)) - iqm(resampled(others, rng, n_resamples))
     return with_percentiles(float(iqm(values) - iqm(others)), draws, min(len(values), len(others)))
+
+
+def rank_test(values: np.ndarray, others: np.ndarray) -> float:
+    """
+    How likely ranks as unlike as these are if the runs of both are alike: the two-sided test of Mann and Whitney, exact unless
+    some of the values are equal.
+
+    :param values: (runs,)
+    :param others: (runs,)
+    :return: p
+    """
+    together = np.concatenate([values, others])
+    method = "exact" if len(np.unique(together)) == len(together) else "asymptotic"
+    return float(mannwhitneyu(values, others, method=method).pvalue)
 
 
 def smallest_difference(values: np.ndarray, others: np.ndarray) -> float:
