@@ -13,11 +13,14 @@ from tests.toy_runs import toy_run
 from zoo import compare, plot, train
 from zoo.plots import ALGO_COLOURS, line_styles
 from zoo.statistics import (
+    LEVEL,
+    ahead,
     improvement,
     improvement_with_interval,
     iqm,
     iqm_curve,
     iqm_with_interval,
+    permutation_test,
     profile,
     profile_with_intervals,
 )
@@ -135,6 +138,54 @@ def test_runs_are_drawn_within_their_world():
     same = {"a": np.zeros(3), "b": np.ones(3)}
     assert iqm_with_interval(same, generator()) == (0.5, 0.5, 0.5)
     assert improvement_with_interval(same, same, generator()) == (0.5, 0.5, 0.5)
+
+
+def splits(values, n):
+    """All ways to deal values out to two, n to the first."""
+    for first in itertools.combinations(range(len(values)), n):
+        yield [values[i] for i in first], [value for i, value in enumerate(values) if i not in first]
+
+
+@pytest.mark.parametrize("moved", [2.5, 3.5, 1.0])
+def test_the_permutation_test_is_the_rank_test_in_one_world(moved):
+    values, others = np.arange(5.0), np.arange(5.0) + moved  # 3 of 25 pairs the other way round, 1, and some equal
+    far = abs(slow_improvement(values, others) - 0.5)
+    every = [abs(slow_improvement(*dealt) - 0.5) >= far - 1e-9 for dealt in splits([*values, *others], 5)]
+    assert len(every) == 252
+    assert permutation_test({"": values}, {"": others}, generator()) == pytest.approx(sum(every) / 252, abs=0.006)
+
+
+def test_the_permutation_test_deals_within_each_world():
+    by_world = [
+        [slow_improvement(*dealt) for dealt in splits([*SCORES[world], *OTHERS[world]], len(SCORES[world]))] for world in "ab"
+    ]
+    far = abs(improvement(SCORES, OTHERS) - 0.5)
+    every = [abs(sum(both) / 2 - 0.5) >= far - 1e-9 for both in itertools.product(*by_world)]
+    assert permutation_test(SCORES, OTHERS, generator()) == pytest.approx(sum(every) / len(every), abs=0.015)
+
+
+def test_the_permutation_test_errs_no_oftener_than_it_says():
+    rng = np.random.default_rng(0)
+    runs = [[{"": own} for own in rng.normal(size=(2, 5))] for _ in range(500)]
+    found = np.mean([permutation_test(*two, rng, 1000) < LEVEL for two in runs])
+    assert 0.01 < found < LEVEL  # of the 252 ways to deal ten runs out, 8 are told
+
+
+def test_who_is_ahead():
+    five, others = np.arange(5.0), np.arange(5.0) + 2.5
+    for values, than, so in (
+        (five, others, None),  # 14 of 252
+        (five, others + 1, False),  # 4 of 252
+        (others + 1, five, True),
+        (others[:4] + 9, five, None),  # too few
+        (np.ones(5), np.zeros(5), True),
+        (np.ones(5), np.ones(5), None),
+        (others + 9, np.array([*five[:4], np.nan]), None),
+    ):
+        assert ahead({"a": values}, {"a": than}, generator()) is so
+    two = {"a": five, "b": five}
+    assert ahead(two, {"a": others, "b": others}, generator()) is False  # together they tell what neither tells
+    assert ahead(two, {"a": others, "b": others[:4]}, generator()) is None
 
 
 def test_the_same_generator_gives_the_same_interval():

@@ -3,7 +3,6 @@ The reproduction: what the command trains and refuses, that nothing is measured 
 and that tables, verdicts and pictures say what the records hold.
 """
 
-import itertools
 import json
 import shutil
 from types import SimpleNamespace
@@ -21,7 +20,7 @@ from zoo.reproduce_records import is_there, read_record
 from zoo.reproduce_report import CANNOT_BE_TOLD, HOLDS, HOLDS_NOT, NOT_A_NUMBER, Results, judged
 from zoo.reproduce_run import as_trained
 from zoo.series import Series, tensorboard_series
-from zoo.statistics import difference_with_interval, rank_test, smallest_difference
+from zoo.statistics import difference_with_interval, smallest_difference
 
 SMALL = {"n_envs": 2, "learning_starts": 20, "batch_size": 8, "buffer_size": 200}
 TINY = {
@@ -583,34 +582,6 @@ def test_the_rule_for_a_cell_and_a_number():
         (Interval(0.4, 0.1, 0.6), 10, None),
     ):
         assert reproduce_report.above(interval, 0.5, n_seeds) is so
-
-
-@pytest.mark.parametrize(("n", "m"), [(5, 5), (4, 6)])
-def test_the_rank_test_counts_orders(n, m):
-    """Of all orders of n + m runs, so many have the ranks of the one as far from the middle as here."""
-    middle = n * (n + m + 1) / 2
-    sums = np.array([sum(ranks) for ranks in itertools.combinations(range(1, n + m + 1), n)])
-    for ranks in itertools.combinations(range(n + m), n):
-        others = np.setdiff1d(np.arange(n + m), ranks)
-        as_far = (np.abs(sums - middle) >= abs(sum(ranks) + n - middle)).mean()
-        assert rank_test(np.array(ranks) ** 2.0, others**2.0) == pytest.approx(as_far)
-
-
-def test_the_rule_for_two_cells():
-    five, others = np.arange(5.0), np.arange(5.0) + 2.5  # 3 of 25 pairs are the other way round: p is 14 / 252
-    assert reproduce_report.ahead(five, others) is None
-    assert reproduce_report.ahead(five, others + 1) is False  # 1 of 25
-    assert reproduce_report.ahead(others + 1, five) is True
-    assert reproduce_report.ahead(others[:4] + 9, five) is None  # too few
-    assert reproduce_report.ahead(np.ones(5), np.zeros(5)) is True  # ties
-    assert reproduce_report.ahead(np.ones(5), np.ones(5)) is None
-    assert reproduce_report.ahead(others + 9, np.array([*five[:4], np.nan])) is None
-
-
-def test_the_rule_for_two_cells_errs_no_oftener_than_it_says():
-    rng = np.random.default_rng(0)
-    told = [reproduce_report.ahead(*rng.normal(size=(2, 5))) for _ in range(1000)]
-    assert 0.015 < np.mean([so is not None for so in told]) < 0.05  # of the orders of ten runs, 8 of 252 are told
 
 
 def test_claims_about_two_cells():

@@ -20,6 +20,7 @@ from zoo.runs import Run
 from zoo.statistics import (
     ENOUGH_RUNS,
     Scores,
+    ahead,
     fewest,
     improvement_with_interval,
     iqm_with_interval,
@@ -75,12 +76,14 @@ class Improvement:
     :param better: X
     :param than: Y
     :param probability: P(X > Y)
+    :param so: whether it is, see :func:`~zoo.statistics.ahead`
     :param n_seeds: of whoever has fewest, in the world where they have fewest
     """
 
     better: str
     than: str
     probability: Interval
+    so: bool | None
     n_seeds: int
 
     @property
@@ -88,9 +91,9 @@ class Improvement:
         """In words."""
         if self.n_seeds < ENOUGH_RUNS:
             return f"cannot be told from fewer than {ENOUGH_RUNS} seeds"
-        if self.probability.low > 0.5:
-            return f"{self.better} is better"
-        return f"{self.than} is better" if self.probability.high < 0.5 else "cannot be told"
+        if self.so is None:
+            return "cannot be told"
+        return f"{self.better if self.so else self.than} is better"
 
 
 @dataclass(frozen=True)
@@ -183,6 +186,7 @@ class Comparison:
                 better,
                 than,
                 improvement_with_interval(self.scores[better], self.scores[than], _generator()),
+                ahead(self.scores[better], self.scores[than], _generator()),
                 min(fewest(self.scores[better]), fewest(self.scores[than])),
             )
             for than, better in combinations(self.labels, 2)

@@ -26,13 +26,11 @@ from zoo.run_groups import algo_label, note
 from zoo.runs import natural
 from zoo.statistics import (
     ENOUGH_RUNS,
-    LEVEL,
+    ahead,
     difference_with_interval,
-    improvement,
     improvement_with_interval,
     iqm_curve,
     iqm_with_interval,
-    rank_test,
     smallest_difference,
 )
 from zoo.sweep_plan import in_one_line
@@ -308,7 +306,7 @@ class Verdict:
 
 def judged(claim: Claim, results: Results) -> Verdict:
     """
-    Hold a claim against the records, see :func:`ahead` for two cells and :func:`above` for a cell and a number.
+    Hold a claim against the records: by :func:`~zoo.statistics.ahead` for two cells, by :func:`above` for a cell and a number.
 
     :param claim: what is claimed
     :param results: of its experiment
@@ -322,10 +320,11 @@ def judged(claim: Claim, results: Results) -> Verdict:
             return Verdict(claim, "", 0, CANNOT_BE_TOLD)
         if np.isnan([*values, *others]).any():
             return Verdict(claim, NOT_A_NUMBER, n_seeds, CANNOT_BE_TOLD)
-        interval = improvement_with_interval({"": sign * values}, {"": sign * others}, _rng())
+        own, theirs = {"": sign * values}, {"": sign * others}
+        interval = improvement_with_interval(own, theirs, _rng())
         places = decimals(np.concatenate([values, others]))
         sides = f"{shown(iqm_of(values), places)} against {shown(iqm_of(others), places)}"
-        numbers, so = f"{sides}; P {shown(interval)}", ahead(sign * values, sign * others)
+        numbers, so = f"{sides}; P {shown(interval)}", ahead(own, theirs, _rng())
     else:
         n_seeds = len(values)
         if not n_seeds:
@@ -333,19 +332,6 @@ def judged(claim: Claim, results: Results) -> Verdict:
         interval = iqm_of(values)
         numbers, so = in_words_or_none(interval, 2), above(iqm_of(sign * values), sign * claim.than, n_seeds)
     return Verdict(claim, numbers, n_seeds, {True: HOLDS, False: HOLDS_NOT, None: CANNOT_BE_TOLD}[so])
-
-
-def ahead(values: np.ndarray, others: np.ndarray) -> bool | None:
-    """
-    The rule for two cells: whether runs of the one are better than runs of the other, by a rank test of ``LEVEL``.
-
-    :param values: of the one, more is better (runs,)
-    :param others: of the other (runs,)
-    :return: ``None`` if it cannot be told: also of fewer than ``ENOUGH_RUNS`` runs of either
-    """
-    if min(len(values), len(others)) < ENOUGH_RUNS or np.isnan([*values, *others]).any():
-        return None
-    return improvement({"": values}, {"": others}) > 0.5 if rank_test(values, others) < LEVEL else None
 
 
 def above(interval: Interval, border: float, n_seeds: int) -> bool | None:
@@ -442,8 +428,8 @@ def _effect(values: np.ndarray, base: np.ndarray, difference: Interval, places: 
 
 
 def better_or_worse(values: np.ndarray, base: np.ndarray) -> str:
-    """What a difference says, see :func:`ahead`."""
-    return {True: "better", False: "worse", None: CANNOT_BE_TOLD}[ahead(values, base)]
+    """Whether runs of a cell are better than those of the default, in a word."""
+    return {True: "better", False: "worse", None: CANNOT_BE_TOLD}[ahead({"": values}, {"": base}, _rng())]
 
 
 def _over_the_training(results: Results, cell: str, default: str, of: str, places: int) -> list[str]:

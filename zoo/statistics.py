@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from scipy.special import stdtrit
-from scipy.stats import mannwhitneyu, trim_mean
+from scipy.stats import trim_mean
 
 from sb3_kfcv.common.evaluation import CONFIDENCE, Interval
 
@@ -23,8 +23,11 @@ N_RESAMPLES = 5_000
 # Of fewer runs an interval says little: too few different samples can be drawn from them.
 ENOUGH_RUNS = 5
 
-# Runs of two that are alike are taken for unlike with this probability.
+# Runs of two that are alike are taken for unlike with this probability, at most.
 LEVEL = 1 - CONFIDENCE
+
+# Draws of the permutation test.
+N_PERMUTATIONS = 20_000
 
 # A difference that is there should be shown with this probability.
 POWER = 0.8
@@ -113,6 +116,43 @@ def improvement_with_interval(
     return with_percentiles(improvement(better, than), draws, min(fewest(better), fewest(than)))
 
 
+def ahead(better: Scores, than: Scores, rng: np.random.Generator) -> bool | None:
+    """
+    The rule of all verdicts on two: whether runs of the one have higher scores than runs of the other, by
+    :func:`permutation_test`.
+
+    :param better: X: world → (runs,)
+    :param than: Y, in the same worlds
+    :param rng: of the test
+    :return: ``None`` if it cannot be told: also of fewer than ``ENOUGH_RUNS`` runs of either in any world, and where a score
+        is no number
+    """
+    scores = [*better.values(), *than.values()]
+    if min(fewest(better), fewest(than)) < ENOUGH_RUNS or np.isnan(np.concatenate(scores)).any():
+        return None
+    return improvement(better, than) > 0.5 if permutation_test(better, than, rng) < LEVEL else None
+
+
+def permutation_test(better: Scores, than: Scores, rng: np.random.Generator, n_permutations: int = N_PERMUTATIONS) -> float:
+    """
+    How probable an :func:`improvement` so far from one half is if both are alike: how often it is as far from it with the runs
+    of each world dealt out anew. In one world this is the two-sided rank test of Mann and Whitney.
+
+    :param better: X: world → (runs,)
+    :param than: Y, in the same worlds
+    :param rng: deals
+    :param n_permutations: how often
+    :return: p
+    """
+    dealt = []
+    for world in better:
+        together = np.concatenate([better[world], than[world]])
+        draws = rng.permuted(np.tile(together, (n_permutations, 1)), axis=1)
+        dealt.append(_improvement(draws[:, : len(better[world])], draws[:, len(better[world]) :]))
+    far = abs(improvement(better, than) - 0.5) - 1e-9  # the same by another order of sums
+    return float((1 + (np.abs(np.mean(dealt, axis=0) - 0.5) >= far).sum()) / (1 + n_permutations))
+
+
 def _improvement(better: np.ndarray, than: np.ndarray) -> np.ndarray:
     """P(X > Y) of each draw: (..., runs) and (..., runs) → (...)."""
     difference = better[..., :, None] - than[..., None, :]
@@ -133,20 +173,6 @@ def difference_with_interval(
     """
     draws = iqm(resampled(values, rng, n_resamples)) - iqm(resampled(others, rng, n_resamples))
     return with_percentiles(float(iqm(values) - iqm(others)), draws, min(len(values), len(others)))
-
-
-def rank_test(values: np.ndarray, others: np.ndarray) -> float:
-    """
-    How likely ranks as unlike as these are if the runs of both are alike: the two-sided test of Mann and Whitney, exact unless
-    some of the values are equal.
-
-    :param values: (runs,)
-    :param others: (runs,)
-    :return: p
-    """
-    together = np.concatenate([values, others])
-    method = "exact" if len(np.unique(together)) == len(together) else "asymptotic"
-    return float(mannwhitneyu(values, others, method=method).pvalue)
 
 
 def smallest_difference(values: np.ndarray, others: np.ndarray) -> float:
