@@ -144,13 +144,14 @@ def parse_point(text: str) -> str | int:
         raise ValueError(f"{unknown_name('--point', text, (LAST, BEST))} or a number of env steps") from None
 
 
-def read_scores(path: str, worlds: Sequence[str]) -> dict[str, tuple[float, float]]:
+def read_scores(path: str, worlds: Sequence[str], sign: int) -> dict[str, tuple[float, float]]:
     """
     World → the values that count as 0 and as 1, from a YAML file.
 
     :param path: of the file
     :param worlds: those that are needed
-    :raises ValueError: if one is missing, or is no pair of different numbers
+    :param sign: see :func:`chosen`
+    :raises ValueError: if one is missing, or is no pair of different numbers, or the better one counts as 0
     """
     given, found = read_map(Path(path)), {}
     for world in worlds:
@@ -163,6 +164,9 @@ def read_scores(path: str, worlds: Sequence[str]) -> dict[str, tuple[float, floa
             low = high = 0.0
         if low == high:
             raise ValueError(f"{path}: {world} must be a map of two different numbers, low and high; it is {pair!r}")
+        if sign * high < sign * low:
+            better = "higher" if sign > 0 else "lower"
+            raise ValueError(f"{path}: low of {world} counts as 0 and high as 1, and {better} is better; it is {pair!r}")
         found[world] = (low, high)
     return found
 
@@ -189,7 +193,7 @@ def build(args: argparse.Namespace) -> Comparison:
     shared = [world for world in worlds if len([group for group in groups if group.env_id == world]) == len(labels)]
     if not shared:
         raise ValueError(f"no world has runs of all of {'; '.join(labels)}: there is nothing to compare them in")
-    limits = read_scores(args.scores, shared) if args.scores else None
+    limits = read_scores(args.scores, shared, sign) if args.scores else None
     warn(groups, outcomes, shared, point)
     return Comparison(groups, outcomes, shared, args.metric, args.eval_name, sign, args.point, limits)
 

@@ -449,10 +449,11 @@ def _over_the_training(results: Results, cell: str, default: str, of: str, place
 
 def claims_table(claims: Sequence[Claim], results: Mapping[str, Results]) -> str:
     """A verdict on each claim."""
-    lines = [["the paper", "here", "seeds", "so"]]
+    lines = [["the paper", "here", "seeds", "scale", "so"]]
     for claim in claims:
-        own = judged(claim, results[claim.experiment])
-        lines.append([claim.says, own.numbers or "not measured yet", str(own.n_seeds), own.word])
+        of_it = results[claim.experiment]
+        own, scale = judged(claim, of_it), f"{of_it.scale:g}"
+        lines.append([claim.says, own.numbers or "not measured yet", str(own.n_seeds), scale if own.numbers else "", own.word])
     return as_markdown(lines)
 
 

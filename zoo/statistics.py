@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from scipy.special import stdtrit
-from scipy.stats import trim_mean
+from scipy.stats import mannwhitneyu, rankdata, trim_mean
 
 from sb3_kfcv.common.evaluation import CONFIDENCE, Interval
 
@@ -26,7 +26,7 @@ ENOUGH_RUNS = 5
 # Runs of two that are alike are taken for unlike with this probability, at most.
 LEVEL = 1 - CONFIDENCE
 
-# Draws of the permutation test.
+# Draws of the permutation test, where it is not exact.
 N_PERMUTATIONS = 20_000
 
 # A difference that is there should be shown with this probability.
@@ -135,28 +135,33 @@ def ahead(better: Scores, than: Scores, rng: np.random.Generator) -> bool | None
 
 def permutation_test(better: Scores, than: Scores, rng: np.random.Generator, n_permutations: int = N_PERMUTATIONS) -> float:
     """
-    How probable an :func:`improvement` so far from one half is if both are alike: how often it is as far from it with the runs
-    of each world dealt out anew. In one world this is the two-sided rank test of Mann and Whitney.
+    How probable an :func:`improvement` so far from one half is if the runs of both are drawn alike: how often it is as far
+    from it with the runs of each world dealt out anew. In one world this is the two-sided rank test of Mann and Whitney, and
+    exact unless some scores are equal.
 
-    :param better: X: world → (runs,)
+    :param better: X: world → (runs,), numbers
     :param than: Y, in the same worlds
     :param rng: deals
-    :param n_permutations: how often
+    :param n_permutations: how often, where all ways are too many to count
     :return: p
     """
+    ranks = {world: rankdata(np.concatenate([better[world], than[world]])) for world in better}
+    if len(ranks) == 1 and all(len(np.unique(own)) == len(own) for own in ranks.values()):
+        (world,) = ranks
+        return float(mannwhitneyu(better[world], than[world], method="exact").pvalue)
     dealt = []
-    for world in better:
-        together = np.concatenate([better[world], than[world]])
-        draws = rng.permuted(np.tile(together, (n_permutations, 1)), axis=1)
-        dealt.append(_improvement(draws[:, : len(better[world])], draws[:, len(better[world]) :]))
+    for world, own in ranks.items():
+        n, m = len(better[world]), len(than[world])
+        of_better = rng.permuted(np.tile(own, (n_permutations, 1)), axis=1)[:, :n].sum(axis=1)
+        dealt.append((of_better - n * (n + 1) / 2) / (n * m))  # the share of pairs in which X is higher
     far = abs(improvement(better, than) - 0.5) - 1e-9  # the same by another order of sums
     return float((1 + (np.abs(np.mean(dealt, axis=0) - 0.5) >= far).sum()) / (1 + n_permutations))
 
 
 def _improvement(better: np.ndarray, than: np.ndarray) -> np.ndarray:
     """P(X > Y) of each draw: (..., runs) and (..., runs) → (...)."""
-    difference = better[..., :, None] - than[..., None, :]
-    return ((difference > 0) + 0.5 * (difference == 0)).mean(axis=(-2, -1))
+    better, than = better[..., :, None], than[..., None, :]
+    return ((better > than) + 0.5 * (better == than)).mean(axis=(-2, -1))
 
 
 def difference_with_interval(
