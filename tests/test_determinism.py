@@ -74,6 +74,7 @@ def test_training_ends_in_the_parameters_written_down(algo, env_id):
 
 
 if __name__ == "__main__":
+    th.set_num_threads(1)  # as in all tests
     GATE.parent.mkdir(exist_ok=True)
     known = json.loads(GATE.read_text()) if GATE.exists() else {"digests": {}}
     measured = measure()

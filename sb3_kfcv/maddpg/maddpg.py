@@ -295,7 +295,7 @@ class MADDPG(JointAlgorithm):
         self.critic_target = self.policy.critic_target
         networks = (self.actor, self.actor_target, self.critic, self.critic_target)
         # Asked for at every update, and slow to gather.
-        self._parameters: dict[nn.Module, list[nn.Parameter]] = {network: list(network.parameters()) for network in networks}
+        self._parameters: dict[nn.Module, list[th.Tensor]] = {network: list(network.parameters()) for network in networks}
 
     @without_denormals()
     @th.no_grad()
@@ -405,8 +405,7 @@ class MADDPG(JointAlgorithm):
 
     def _follow(self, targets: nn.Module, networks: nn.Module) -> None:
         """θ' ← τθ + (1 − τ)θ'"""
-        for target, parameter in zip(self._parameters[targets], self._parameters[networks], strict=True):
-            target.lerp_(parameter, self.tau)
+        th._foreach_lerp_(self._parameters[targets], self._parameters[networks], self.tau)
 
     def _check_losses(self, quantity: str, losses: th.Tensor) -> None:
         """

@@ -15,9 +15,10 @@ from torch import nn
 
 from sb3_kfcv.common.actors import ActorPolicy, Block, StackedActors, by_agent, hidden_sizes, shared_members
 from sb3_kfcv.common.adam import LeanAdam
+from sb3_kfcv.common.backpropagation import Evaluation
 from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.layout import AgentLayout
-from sb3_kfcv.common.stacked_networks import Evaluation, StackedMLP, at_most
+from sb3_kfcv.common.stacked_networks import StackedMLP, at_most
 from sb3_kfcv.saving.archive import open_archive, write_archive
 from sb3_kfcv.saving.parameters import check_network
 from sb3_kfcv.saving.saveable import refusals

@@ -1,0 +1,264 @@
+"""
+Layers of many small networks, forward and backward, as compiled loops: network after network, so that what one layer writes
+the next one finds in the processor's cache, and without handing each step of each layer to PyTorch.
+
+The arithmetic is that of :class:`~sb3_kfcv.common.backpropagation.Evaluation`. Every sum of products runs over its terms in
+their order, one fused multiplication and addition each, on every processor.
+"""
+
+from __future__ import annotations
+
+import platform
+from typing import Any
+
+import llvmlite.binding as llvm
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+FLOAT = 4
+"""Bytes of a number."""
+
+LAYER = np.dtype(
+    [
+        (name, np.int64)
+        for name in (
+            # Addresses and strides in numbers, of float32 tensors whose rows are contiguous. 0 is the address of nothing.
+            *("x", "x_member", "x_row", "x_gradient"),  # what it reads, (members, rows, in), and its gradient
+            *("z", "z_member", "z_row"),  # what it gives, (members, rows, out)
+            *("z_gradient", "z_gradient_member", "z_gradient_row"),
+            *("weight", "bias", "weight_gradient", "bias_gradient"),  # (networks, in, out) and (networks, 1, out)
+            *("n_in", "n_out"),
+        )
+    ]
+)
+"""A layer of a stack. The gradient of what it reads lies as that itself does."""
+
+
+_FEATURES = llvm.get_host_cpu_features()
+
+FUSED = platform.machine().lower() in ("aarch64", "arm64") or bool(_FEATURES.get("fma"))
+"""Whether the processor multiplies and adds in one; where it does not, these loops are slow."""
+
+# Of a tile: eight vectors of sums keep the processor busy, a row is one of 16 numbers or two of 8.
+ROWS = 8 if _FEATURES.get("avx512f") else 4
+COLUMNS = 16
+
+
+def _tile(n_rows: int, n_columns: int) -> Any:
+    """
+    The function C += A B for a tile of C that stays in registers.
+
+    Its arguments are integers: of A the address and the strides from row to row and from column to column, of B the address
+    and the stride from row to row, the number of A's columns, of C the address and the stride from row to row.
+    """
+
+    @intrinsic
+    def add_to_tile(typing_context, a, a_row, a_column, b, b_row, depth, c, c_row):  # type: ignore[no-untyped-def]
+        def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+            a, a_row, a_column, b, b_row, depth, c, c_row = arguments
+            integer, number = ir.IntType(64), ir.FloatType()
+            vector = ir.VectorType(number, n_columns)
+            name = f"llvm.fma.v{n_columns}f32"
+            fma = cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector, [vector] * 3), name)
+            nothing, first = ir.Constant(vector, ir.Undefined), ir.Constant(ir.VectorType(ir.IntType(32), n_columns), None)
+
+            def address(start, *steps):  # type: ignore[no-untyped-def]
+                for count, stride in steps:
+                    start = builder.add(start, builder.mul(builder.mul(count, stride), ir.Constant(integer, FLOAT)))
+                return start
+
+            def pointer(kind, start, *steps):  # type: ignore[no-untyped-def]
+                return builder.inttoptr(address(start, *steps), kind.as_pointer())
+
+            rows = [ir.Constant(integer, row) for row in range(n_rows)]
+            places = [pointer(vector, c, (row, c_row)) for row in rows]
+            before = [builder.load(place, align=FLOAT) for place in places]
+
+            entry = builder.block
+            loop, done = builder.append_basic_block("depth"), builder.append_basic_block("done")
+            builder.branch(loop)
+            builder.position_at_end(loop)
+            k = builder.phi(integer)
+            k.add_incoming(ir.Constant(integer, 0), entry)
+            sums = [builder.phi(vector) for _ in rows]
+            read = builder.load(pointer(vector, b, (k, b_row)), align=FLOAT)
+            after = []
+            for row, total in zip(rows, sums, strict=True):
+                factor = builder.load(pointer(number, a, (row, a_row), (k, a_column)), align=FLOAT)
+                one = builder.insert_element(nothing, factor, ir.Constant(ir.IntType(32), 0))
+                after.append(builder.call(fma, [builder.shuffle_vector(one, nothing, first), read, total]))
+            following = builder.add(k, ir.Constant(integer, 1))
+            k.add_incoming(following, loop)
+            for total, start, end in zip(sums, before, after, strict=True):
+                total.add_incoming(start, entry)
+                total.add_incoming(end, loop)
+            builder.cbranch(builder.icmp_signed("<", following, depth), loop, done)
+            builder.position_at_end(done)
+            for place, end in zip(places, after, strict=True):
+                builder.store(end, place, align=FLOAT)
+            return context.get_dummy_value()
+
+        return types.void(*[types.int64] * 8), generate
+
+    return add_to_tile
+
+
+_tile_large, _tile_4, _tile_1 = (_tile(ROWS, columns) for columns in (COLUMNS, 4, 1))
+_row_large, _row_4, _row_1 = (_tile(1, columns) for columns in (COLUMNS, 4, 1))
+
+
+def _reader() -> Any:
+    """The function that gives the numbers at an address, to be indexed."""
+
+    @intrinsic
+    def numbers_at(typing_context, address):  # type: ignore[no-untyped-def]
+        signature = types.CPointer(types.float32)(types.int64)
+
+        def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+            return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+        return signature, generate
+
+    return numbers_at
+
+
+_numbers_at = _reader()
+
+
+@njit(cache=True)
+def add_product(a, a_row, a_column, b, b_row, c, c_row, n_rows, depth, n_columns):
+    """
+    C += A B of matrices at addresses, their strides counted in numbers; the rows of B and C are contiguous.
+
+    :param a: of A (n_rows, depth); ``a_row``, ``a_column``: from row to row, from column to column
+    :param b: of B (depth, n_columns); ``b_row``: from row to row
+    :param c: of C (n_rows, n_columns); ``c_row``: from row to row
+    """
+    if depth == 0:
+        return
+    whole = n_rows - n_rows % ROWS
+    j = 0
+    while j < n_columns:
+        left = n_columns - j
+        b_j, c_j = b + FLOAT * j, c + FLOAT * j
+        for i in range(0, whole, ROWS):
+            a_i, c_i = a + FLOAT * i * a_row, c_j + FLOAT * i * c_row
+            if left >= COLUMNS:
+                _tile_large(a_i, a_row, a_column, b_j, b_row, depth, c_i, c_row)
+            elif left >= 4:
+                _tile_4(a_i, a_row, a_column, b_j, b_row, depth, c_i, c_row)
+            else:
+                _tile_1(a_i, a_row, a_column, b_j, b_row, depth, c_i, c_row)
+        for i in range(whole, n_rows):
+            a_i, c_i = a + FLOAT * i * a_row, c_j + FLOAT * i * c_row
+            if left >= COLUMNS:
+                _row_large(a_i, a_row, a_column, b_j, b_row, depth, c_i, c_row)
+            elif left >= 4:
+                _row_4(a_i, a_row, a_column, b_j, b_row, depth, c_i, c_row)
+            else:
+                _row_1(a_i, a_row, a_column, b_j, b_row, depth, c_i, c_row)
+        j += COLUMNS if left >= COLUMNS else 4 if left >= 4 else 1
+
+
+@njit(cache=True)
+def _fill(address, row, n_rows, n_columns, values):
+    """Set every row to the numbers at ``values``, or to 0 where that is 0."""
+    source = _numbers_at(values)
+    for i in range(n_rows):
+        into = _numbers_at(address + FLOAT * i * row)
+        if values == 0:
+            for j in range(n_columns):
+                into[j] = np.float32(0)
+        else:
+            for j in range(n_columns):
+                into[j] = source[j]
+
+
+@njit(cache=True)
+def _rectify(address, row, n_rows, n_columns):
+    """ReLU in place; what is not a number stays so."""
+    for i in range(n_rows):
+        z = _numbers_at(address + FLOAT * i * row)
+        for j in range(n_columns):
+            z[j] *= np.float32(not z[j] < 0)  # a product, since choices are not compiled to vectors
+
+
+@njit(cache=True)
+def _through_rectifier(gradient, hidden, row, n_rows, n_columns):
+    """Turn the gradient behind a ReLU, whose outputs are given and lie alike, into the one before it."""
+    for i in range(n_rows):
+        g, h = _numbers_at(gradient + FLOAT * i * row), _numbers_at(hidden + FLOAT * i * row)
+        for j in range(n_columns):
+            g[j] *= np.float32(not h[j] <= 0)
+
+
+@njit(cache=True)
+def _transpose(matrix, n_rows, n_columns, into):
+    """Of a contiguous matrix."""
+    read, written = _numbers_at(matrix), _numbers_at(into)
+    for i in range(n_rows):
+        for j in range(n_columns):
+            written[j * n_rows + i] = read[i * n_columns + j]
+
+
+@njit(cache=True, nogil=True)
+def forward(layers, members, n_rows, rectify_first):
+    """
+    Evaluate consecutive layers.
+
+    :param layers: array of ``LAYER``
+    :param members: network of each member
+    :param n_rows: rows of each member
+    :param rectify_first: whether what the first layer reads is to go through a ReLU, as what all others read
+    """
+    for member, network in enumerate(members):
+        for i in range(len(layers)):
+            layer = layers[i]
+            x, z = layer.x + FLOAT * member * layer.x_member, layer.z + FLOAT * member * layer.z_member
+            size = FLOAT * layer.n_out
+            if i > 0 or rectify_first:
+                _rectify(x, layer.x_row, n_rows, layer.n_in)
+            _fill(z, layer.z_row, n_rows, layer.n_out, layer.bias + network * size)
+            weight = layer.weight + network * layer.n_in * size
+            add_product(x, layer.x_row, 1, weight, layer.n_out, z, layer.z_row, n_rows, layer.n_in, layer.n_out)
+
+
+@njit(cache=True, nogil=True)
+def backward(layers, members, n_networks, n_rows, scratch):
+    """
+    Backpropagation from the last layer's ``z_gradient``: write the gradients of weights, biases and inputs where they have an
+    address. What a layer reads is taken to have come out of a ReLU, and its gradient becomes the one before that.
+
+    :param layers: array of ``LAYER``, evaluated
+    :param members: network of each member
+    :param n_networks: number of networks
+    :param n_rows: rows of each member
+    :param scratch: room for the largest weight of a network, and behind it a one
+    """
+    transposed = scratch.ctypes.data
+    one = transposed + FLOAT * (len(scratch) - 1)
+    for layer in layers:
+        if layer.weight_gradient:
+            _fill(layer.weight_gradient, layer.n_out, n_networks * layer.n_in, layer.n_out, 0)
+        if layer.bias_gradient:
+            _fill(layer.bias_gradient, layer.n_out, n_networks, layer.n_out, 0)
+    for member, network in enumerate(members):
+        for i in range(len(layers) - 1, -1, -1):
+            layer = layers[i]
+            n_in, n_out, size = layer.n_in, layer.n_out, FLOAT * layer.n_out
+            x = layer.x + FLOAT * member * layer.x_member
+            gradient, row = layer.z_gradient + FLOAT * member * layer.z_gradient_member, layer.z_gradient_row
+            if layer.weight_gradient:
+                into = layer.weight_gradient + network * n_in * size
+                add_product(x, 1, layer.x_row, gradient, row, into, n_out, n_in, n_rows, n_out)
+            if layer.bias_gradient:
+                add_product(one, 0, 0, gradient, row, layer.bias_gradient + network * size, n_out, 1, n_rows, n_out)
+            if layer.x_gradient:
+                into = layer.x_gradient + FLOAT * member * layer.x_member
+                _transpose(layer.weight + network * n_in * size, n_in, n_out, transposed)
+                _fill(into, layer.x_row, n_rows, n_in, 0)
+                add_product(gradient, row, 1, transposed, n_in, into, layer.x_row, n_rows, n_out, n_in)
+                _through_rectifier(into, x, layer.x_row, n_rows, n_in)

@@ -1,0 +1,163 @@
+"""Compiled layers give the values and gradients of PyTorch, at all sizes, and nothing else is read or written."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch as th
+from torch import nn
+
+from sb3_kfcv.common.backpropagation import Evaluation
+from sb3_kfcv.common.compiled_backpropagation import WIDEST, CompiledEvaluation
+from sb3_kfcv.common.compiled_layers import add_product
+from sb3_kfcv.common.stacked_networks import StackedMLP
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    th.manual_seed(0)
+
+
+def close(one, other):
+    th.testing.assert_close(one.double(), other, atol=1e-5, rtol=1e-5)
+
+
+def within(rows, columns, rng):
+    """A matrix as a part of a larger one."""
+    return rng.standard_normal((rows + 3, columns + 5), dtype=np.float32)[1 : rows + 1, 2 : columns + 2]
+
+
+@pytest.mark.parametrize("transposed", [False, True], ids=["", "A transposed"])
+@pytest.mark.parametrize("columns", [1, 2, 4, 5, 15, 16, 17, 37, 64])
+@pytest.mark.parametrize("rows", [1, 3, 8, 13, 64])
+@pytest.mark.parametrize("depth", [0, 1, 2, 31])
+def test_products_are_added_to_what_is_there(depth, rows, columns, transposed):
+    rng = np.random.default_rng(0)
+    a = within(depth, rows, rng).T if transposed else within(rows, depth, rng)
+    b, c = within(depth, columns, rng), within(rows, columns, rng)
+    expected, around = c + a.astype(float) @ b, c.base.copy()
+    strides = [stride // 4 for matrix in (a, b, c) for stride in matrix.strides]
+    add_product(a.ctypes.data, *strides[:2], b.ctypes.data, strides[2], c.ctypes.data, strides[4], rows, depth, columns)
+    np.testing.assert_allclose(c, expected, atol=1e-4)
+    around[1 : rows + 1, 2 : columns + 2] = c
+    assert np.array_equal(c.base, around)
+
+
+def test_sums_run_over_their_terms_in_order():
+    """Whatever the size of a matrix: the same numbers give the same bits wherever they stand."""
+    rng = np.random.default_rng(0)
+    a, b = rng.standard_normal((37, 50), dtype=np.float32), rng.standard_normal((50, 37), dtype=np.float32)
+    b[:], a[:] = b[:, :1], a[:1]
+    c = np.zeros((37, 37), np.float32)
+    add_product(a.ctypes.data, 50, 1, b.ctypes.data, 37, c.ctypes.data, 37, 37, 50, 37)
+    assert len(np.unique(c)) == 1
+
+
+KINDS = {
+    "own inputs": {},
+    "a common input": {"common_input": True},
+    "shared": {"members": [0, 3, 1, 0, 2]},
+    "shared, a common input": {"members": [0, 3, 1, 0, 2], "common_input": True},
+    "shared by equal runs": {"members": [i // 2 for i in range(8)]},
+}
+
+
+@pytest.mark.parametrize("batch", [1, 13, 128])
+@pytest.mark.parametrize("sizes", [[5, 7, 6, 2], [24, 64, 64, 5], [3, 20, 1]], ids=str)
+@pytest.mark.parametrize("kind", KINDS)
+def test_evaluation_and_backward_are_those_of_autograd(kind, sizes, batch):
+    """Twice, with other inputs: nothing of the first evaluation is left in the tensors that the second uses again."""
+    stack = StackedMLP(4, sizes, **KINDS[kind])
+    exact = copy.deepcopy(stack).double()
+    for _ in range(2):
+        x = th.randn(1 if stack.common_input else stack.n_members, batch, sizes[0])
+        gradient = th.randn(stack.n_members, batch, sizes[-1]) / batch
+        values = exact(x.double())
+        expected = th.autograd.grad(values, list(exact.parameters()), gradient.double())
+        close(stack.evaluate(x), values.detach())
+        assert isinstance(stack.evaluation(batch), CompiledEvaluation)
+        stack.backward(gradient)
+        for parameter, theirs in zip(stack.parameters(), expected, strict=True):
+            close(parameter.grad, theirs)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_gradient_before_the_first_layer_needs_no_gradients_of_parameters(kind):
+    stack = StackedMLP(4, [5, 7, 6, 2], **KINDS[kind])
+    exact = copy.deepcopy(stack).double()
+    evaluation, theirs = stack.evaluation(9), Evaluation(exact, 9)
+    x, gradient = th.randn(1 if stack.common_input else stack.n_members, 9, 5), th.randn(stack.n_members, 9, 2)
+    for of, convert in ((evaluation, th.Tensor.float), (theirs, th.Tensor.double)):
+        of.first_layer(convert(x)).add_(0.1)
+        of.rest()
+    close(evaluation.backward(gradient, parameters=False), theirs.backward(gradient.double(), parameters=False))
+    assert all(parameter.grad is None for parameter in stack.parameters())
+
+
+def test_inputs_may_lie_apart():
+    """Observations of agents are columns of joint rows; what all share is there once; other types are converted."""
+    stack = StackedMLP(3, [4, 6, 2])
+    rows = th.randn(10, 3 * 4)
+    for x in (
+        rows.view(10, 3, 4).transpose(0, 1),
+        rows[:, :4].expand(3, -1, -1),
+        rows[:, ::3].expand(3, -1, -1),
+        rows[:, :4].double().expand(3, -1, -1),
+    ):
+        assert not x.is_contiguous()
+        close(stack.evaluate(x), copy.deepcopy(stack).double()(x.double()).detach())
+
+
+@pytest.mark.parametrize("frozen", ["first", "rest.0", "rest.1"])
+def test_frozen_parameters_get_no_gradient(frozen):
+    stack = StackedMLP(3, [4, 6, 2, 2])
+    stack.get_submodule(frozen).weight.requires_grad_(False)
+    stack.evaluate(th.randn(3, 5, 4))
+    stack.backward(th.randn(3, 5, 2))
+    assert [name for name, parameter in stack.named_parameters() if parameter.grad is None] == [f"{frozen}.weight"]
+
+
+def test_what_is_not_a_number_stays_so():
+    stack = StackedMLP(2, [4, 6, 6, 1])
+    x = th.randn(2, 5, 4)
+    x[1, 3, 0] = th.nan
+    values = stack.evaluate(x)
+    assert values.isnan().squeeze(-1).tolist() == [[False] * 5, [False] * 3 + [True, False]]
+
+
+@pytest.mark.parametrize("shape", [(2, 5, 4), (3, 6, 4), (3, 5, 3)], ids=str)
+def test_other_shapes_are_refused(shape):
+    stack = StackedMLP(3, [4, 6, 2])
+    evaluation = stack.evaluation(5)
+    with pytest.raises(ValueError, match=r"expected \(networks, rows, features\) = \(3, 5, 4\), got \(\d, \d, \d\)"):
+        evaluation.first_layer(th.zeros(shape))
+    stack.evaluate(th.randn(3, 5, 4))
+    with pytest.raises(ValueError, match=r"= \(3, 5, 2\), got \(3, 5, 1\)"):
+        stack.backward(th.zeros(3, 5, 1))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"activation_fn": nn.Tanh},
+        {"layer_norm": True},
+        {"sizes": [4, 2]},
+        {"sizes": [4, WIDEST + 1, 2]},
+    ],
+    ids=str,
+)
+def test_all_other_stacks_are_evaluated_by_pytorch(change):
+    stack = StackedMLP(3, **{"sizes": [4, 6, 2], **change})
+    assert type(stack.evaluation(5)) is Evaluation
+
+
+def test_with_more_threads_pytorch_shares_the_work_among_them():
+    stack = StackedMLP(3, [4, 6, 2])
+    assert type(stack.evaluation(5)) is CompiledEvaluation
+    th.set_num_threads(2)
+    try:
+        assert type(stack.evaluation(5)) is Evaluation
+    finally:
+        th.set_num_threads(1)
+    assert type(stack.evaluation(5)) is CompiledEvaluation
+    assert type(stack.double().evaluation(5)) is Evaluation
