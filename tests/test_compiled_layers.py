@@ -117,6 +117,16 @@ def test_frozen_parameters_get_no_gradient(frozen):
     assert [name for name, parameter in stack.named_parameters() if parameter.grad is None] == [f"{frozen}.weight"]
 
 
+def test_gradients_that_others_have_set_are_written_anew():
+    stack = StackedMLP(3, [4, 6, 2])
+    x, gradient = th.randn(3, 5, 4), th.randn(3, 5, 2)
+    expected = th.autograd.grad(stack(x), stack.rest[0].weight, gradient)[0]
+    stack.rest[0].weight.grad = th.ones(3, 2, 6).transpose(1, 2)
+    stack.evaluate(x)
+    stack.backward(gradient)
+    close(stack.rest[0].weight.grad, expected.double())
+
+
 def test_what_is_not_a_number_stays_so():
     stack = StackedMLP(2, [4, 6, 6, 1])
     x = th.randn(2, 5, 4)

@@ -102,4 +102,6 @@ class CompiledEvaluation(Evaluation):
         """Say whose gradients are to be written."""
         for name, parameter in (("weight_gradient", weight), ("bias_gradient", bias)):
             into = None if parameter is None else gradient_of(parameter)
+            if parameter is not None and into is not None and not into.is_contiguous():
+                into = parameter.grad = into.contiguous()
             layer[name] = 0 if into is None else into.data_ptr()
