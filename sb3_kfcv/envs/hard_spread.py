@@ -450,22 +450,24 @@ def _find_covered(covers, nearest, positions, landmarks, exclusive_cover, totals
     n = positions.shape[0]
     covered = 0
     covers[:] = False
-    nearest[:] = np.inf
+    nearest[:] = np.inf  # squares, until all are known
     for j in range(n):
         closest = 0
-        closest_distance = np.inf
+        closest_square = np.inf
         for i in range(n):
-            distance = physics.distance(positions[i], landmarks[j])
-            nearest[i] = min(nearest[i], distance)
-            if distance < closest_distance:
-                closest, closest_distance = i, distance
-            if distance <= COVER_DISTANCE and not exclusive_cover:
-                covers[i] = True
+            square = physics.squared_distance(positions[i], landmarks[j])
+            nearest[i] = min(nearest[i], square)
+            if square < closest_square:
+                closest, closest_square = i, square
+        closest_distance = math.sqrt(closest_square)
         if closest_distance <= COVER_DISTANCE:
             covers[closest] = True
             covered += 1
         totals[LANDMARK_DISTANCES] += closest_distance
     for i in range(n):
+        nearest[i] = math.sqrt(nearest[i])
+        if not exclusive_cover:
+            covers[i] = nearest[i] <= COVER_DISTANCE
         totals[AGENT_DISTANCES] += nearest[i]
     totals[COVERED] += covered
     totals[COVERED_LAST] = covered

@@ -275,8 +275,14 @@ def stop_at_mid_line(previous, position, wall_x, door_low, door_high):
 
 
 @njit(cache=True)
-def distance(a, b):
-    """Distance between two points, (2,) each."""
+def squared_distance(a, b):
+    """Square of the distance between two points, (2,) each."""
     dx = a[0] - b[0]
     dy = a[1] - b[1]
-    return math.sqrt(dx * dx + dy * dy)
+    return dx * dx + dy * dy
+
+
+@njit(cache=True)
+def distance(a, b):
+    """Distance between two points, (2,) each."""
+    return math.sqrt(squared_distance(a, b))
