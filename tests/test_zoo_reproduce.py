@@ -5,6 +5,7 @@ and that tables, verdicts and pictures say what the records hold.
 
 import json
 import shutil
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -474,6 +475,23 @@ def test_bad_words(tmp_path, capsys, words, sentence):
         ({"effects": {"default": "maddpg"}}, "spread: effects needs default and quantity, not"),
         ({"effects": {"defualt": "maddpg"}}, 'unknown key of the effects of spread "defualt"; did you mean "default"?'),
         (
+            {"contrasts": [{"says": "a", "of": ["maddpg"], "than": ["per_maddpg"]}]},
+            "spread: contrasts are by the quantities of effects, and there are none",
+        ),
+        ({"contrasts": [{"says": "a", "off": ["maddpg"]}]}, 'unknown key of a contrast of spread "off"; did you mean "of"?'),
+        ({"contrasts": [{"says": "a", "of": ["maddpg"]}]}, "spread: a contrast needs says, of and than, not"),
+        (
+            {"contrasts": [{"says": "a", "of": ["maddpg"], "than": ["maddpg"]}]},
+            "spread: the contrast a has maddpg on both sides",
+        ),
+        (
+            {
+                "contrasts": [{"says": "a", "of": ["maddpg"], "than": ["mapdg"]}],
+                "effects": {"default": "maddpg", "quantity": "test/own/length"},
+            },
+            'unknown cell of spread "mapdg"; did you mean "maddpg"?',
+        ),
+        (
             {"sweeps": [{"algos": ["maddpg"], "envs": ["HardSpread-v0"], "train": {"eval-freq": -1}}], "published": {}},
             "spread: maddpg is never evaluated (eval-freq -1), and curve/eval/cover_rate is to be shown",
         ),
@@ -621,6 +639,28 @@ def test_effects_stand_beside_the_default_the_largest_first():
     assert [(line[0], line[4]) for line in lines] == [("| MADDPG", ""), ("| MADDPG", "worse"), ("| MADDPG", "better")]
     # the middle three of each: 1.0, 1.2 and 0.1
     assert [float(line[2].split(" [")[0]) for line in lines[1:]] == pytest.approx([-0.9, 0.2])
+
+
+def contrasted(than, **means):
+    told = results(default=[0.0] * 5, **means)
+    contrast = {"says": "a and b / the rest", "of": ["a", "b"], "than": than}
+    experiment = replace(told.experiment, contrasts=[contrast])
+    head, _, line = reproduce_report.contrasts_table(replace(told, experiment=experiment)).splitlines()
+    assert head == "|  | difference of x | so | runs | seeds |"
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_contrasts_are_of_means_over_cells_seed_by_seed():
+    """What the runs of a seed have in common, here 0, 10, 20, 30 and 40, counts for nothing."""
+    a, b, c = [1, 11, 21, 31, 41], [3, 13, 23, 33, 43], [1, 11.1, 20.9, 31, 41]
+    # means of a and b less c: 1, 0.9, 1.1, 1, 1: a standard error of 0.0316, times t of 4 degrees of freedom, 2.776
+    assert contrasted(["c"], a=a, b=b, c=c) == ["a and b / the rest", "1.000 [0.912, 1.088]", "better", "10 / 5", "5"]
+    assert contrasted(["c"], a=a, b=b, c=[8, 8, 8, 8, 8])[1:3] == ["14.00 [-5.63, 33.63]", CANNOT_BE_TOLD]
+
+
+def test_contrasts_take_seeds_that_all_have():
+    assert contrasted(["c"], a=[1, 2, 3], b=[1, 2, 3], c=[2, 3.1, 4, 5])[2:] == [CANNOT_BE_TOLD, "6 / 4", "3"]
+    assert contrasted(["d"], a=[1, 2, 3], b=[1, 2, 3])[1:] == ["not a number", CANNOT_BE_TOLD, "6 / 0", "0"]
 
 
 def test_effects_at_equal_time():

@@ -57,9 +57,11 @@ EXPERIMENT_KEYS = {
     "source": str,
     "published": dict[str, dict[str, float | list[float]]],
     "effects": dict[str, str],
+    "contrasts": list[dict[str, Any]],
     "pictures": dict[str, list[dict[str, Any]]],
 }
 EFFECTS_KEYS = ("default", "quantity", "course")
+CONTRAST_KEYS = {"says": str, "of": list[str], "than": list[str]}
 SIDES = ("lower", "higher")
 TABLES = ("claims", "runs")  # of the page, beside those of the experiments
 PANELS = ("curve", "scatter", "estimates", "rivals")
@@ -95,6 +97,7 @@ class Experiment:
     source: str = ""
     published: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     effects: Mapping[str, str] = field(default_factory=dict)
+    contrasts: Sequence[Mapping[str, Any]] = ()
     pictures: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
 
     @property
@@ -257,7 +260,8 @@ def _experiment(name: str, given: Mapping[str, Any]) -> Experiment:
         _check_panel(name, panel)
     _check_effects(experiment)
     default = [experiment.effects["default"]] if experiment.effects else []
-    for cell in [*experiment.published, *default, *(cell for panel in panels for cell in panel.get("cells", ()))]:
+    contrasted = [cell for contrast in experiment.contrasts for cell in [*contrast["of"], *contrast["than"]]]
+    for cell in [*experiment.published, *default, *contrasted, *(cell for panel in panels for cell in panel.get("cells", ()))]:
         require_cell(experiment, cell)
     for of in experiment.quantities:
         require_quantity(experiment, of)
@@ -326,6 +330,14 @@ def _check_effects(experiment: Experiment) -> None:
     course = effects.get("course", "curve/")
     if not course.startswith("curve/"):
         raise ValueError(f"{name}: course of effects is {course}; it must be of curve/…")
+    for contrast in experiment.contrasts:
+        own = checked(f"key of a contrast of {name}", contrast, CONTRAST_KEYS)
+        if not all(own.get(key) for key in CONTRAST_KEYS):
+            raise ValueError(f"{name}: a contrast needs says, of and than, not {in_one_line(contrast)}")
+        if both := set(own["of"]) & set(own["than"]):
+            raise ValueError(f"{name}: the contrast {own['says']} has {_listed(sorted(both))} on both sides")
+    if experiment.contrasts and not effects:
+        raise ValueError(f"{name}: contrasts are by the quantities of effects, and there are none")
 
 
 def _check_panel(name: str, panel: Mapping[str, Any]) -> None:

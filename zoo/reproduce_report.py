@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import ScalarFormatter
 
-from sb3_kfcv.common.evaluation import Interval
+from sb3_kfcv.common.evaluation import Interval, with_interval
 from sb3_kfcv.common.memory import in_words
 from zoo.compare_results import BOOTSTRAP_SEED, clock_time, decimals
 from zoo.hyperparams import CO_TRAINING
@@ -447,6 +447,40 @@ def _over_the_training(results: Results, cell: str, default: str, of: str, place
     return [in_words_or_none(difference, places), so, time, in_words_or_none(late, places)]
 
 
+def contrasts_table(results: Results) -> str:
+    """Cells taken together beside other cells taken together, by the quantities of the effects."""
+    effects = results.experiment.effects
+    head = ["", f"difference of {described(effects['quantity'].rpartition('/')[2])}", "so"]
+    head += ["difference over the training", "so"] if "course" in effects else []
+    lines = [[*head, "runs", "seeds"]]
+    for contrast in results.experiment.contrasts:
+        line, sides = [contrast["says"]], (contrast["of"], contrast["than"])
+        for of in (effects[key] for key in ("quantity", "course") if key in effects):
+            differences = contrast_of(results, *sides, of)
+            interval = with_interval(differences) if len(differences) else NO_NUMBER
+            so = {True: "better", False: "worse", None: CANNOT_BE_TOLD}[above(interval, 0.0, len(differences))]
+            line += [in_words_or_none(interval, places_of(differences)), so]
+        n_runs_of = " / ".join(str(sum(len(results.cells.get(cell, ())) for cell in side)) for side in sides)
+        lines.append([*line, n_runs_of, str(len(differences))])
+    return as_markdown(lines)
+
+
+def contrast_of(results: Results, cells: Sequence[str], than: Sequence[str], of: Quantity) -> np.ndarray:
+    """
+    The mean over some cells less that over others, for each seed that all of them have: runs of one seed have their worlds and
+    their first networks in common, which can make them alike.
+
+    :return: (seeds,)
+    """
+    by_seed: list[dict[int, float]] = [
+        {record["identity"]["seed"]: quantity(record, of) for record in results.cells.get(cell, ())}
+        for cell in [*cells, *than]
+    ]
+    seeds = sorted(set.intersection(*map(set, by_seed)))
+    values = np.array([[own[seed] for seed in seeds] for own in by_seed])
+    return values[: len(cells)].mean(axis=0) - values[len(cells) :].mean(axis=0)
+
+
 def claims_table(claims: Sequence[Claim], results: Mapping[str, Results]) -> str:
     """A verdict on each claim."""
     lines = [["the paper", "here", "seeds", "scale", "so"]]
@@ -503,7 +537,11 @@ def table_of(name: str, claims: Sequence[Claim], results: Mapping[str, Results])
     if name not in results:
         raise ValueError(f"there is no table {name}; there are claims, runs, {', '.join(results)}")
     own = results[name]
-    tables = {results_table: own.experiment.columns, effects_table: own.experiment.effects}
+    tables: dict[Callable[[Results], str], Any] = {
+        results_table: own.experiment.columns,
+        effects_table: own.experiment.effects,
+        contrasts_table: own.experiment.contrasts,
+    }
     if not own.cells:
         return f"*Not measured yet: `python zoo/reproduce.py {name}`.*"
     parts = [table(own) for table, wanted in tables.items() if wanted]
