@@ -42,9 +42,8 @@ _FEATURES = llvm.get_host_cpu_features()
 FUSED = platform.machine().lower() in ("aarch64", "arm64") or bool(_FEATURES.get("fma"))
 """Whether the processor multiplies and adds in one; where it does not, these loops are slow."""
 
-# Of a tile: eight vectors of sums keep the processor busy, a row is one of 16 numbers or two of 8.
+# Rows of a tile: eight vectors of sums keep the processor busy, and a row of 16 numbers is one vector or two.
 ROWS = 8 if _FEATURES.get("avx512f") else 4
-COLUMNS = 16
 
 
 def _tile(n_rows: int, n_columns: int) -> Any:
@@ -106,8 +105,24 @@ def _tile(n_rows: int, n_columns: int) -> Any:
     return add_to_tile
 
 
-_tile_large, _tile_4, _tile_1 = (_tile(ROWS, columns) for columns in (COLUMNS, 4, 1))
-_row_large, _row_4, _row_1 = (_tile(1, columns) for columns in (COLUMNS, 4, 1))
+def _strip(n_columns: int) -> Any:
+    """The same for all rows of C, tile by tile and then row by row."""
+    tile, row = _tile(ROWS, n_columns), _tile(1, n_columns)
+
+    @njit  # on the disk as a part of what calls it
+    def add_to_strip(a, a_row, a_column, b, b_row, c, c_row, n_rows, depth):  # type: ignore[no-untyped-def]
+        i = 0
+        while i + ROWS <= n_rows:
+            tile(a + FLOAT * i * a_row, a_row, a_column, b, b_row, depth, c + FLOAT * i * c_row, c_row)
+            i += ROWS
+        while i < n_rows:
+            row(a + FLOAT * i * a_row, a_row, a_column, b, b_row, depth, c + FLOAT * i * c_row, c_row)
+            i += 1
+
+    return add_to_strip
+
+
+_strip_of_16, _strip_of_4, _strip_of_1 = (_strip(columns) for columns in (16, 4, 1))
 
 
 def _reader() -> Any:
@@ -139,28 +154,18 @@ def add_product(a, a_row, a_column, b, b_row, c, c_row, n_rows, depth, n_columns
     """
     if depth == 0:
         return
-    whole = n_rows - n_rows % ROWS
     j = 0
     while j < n_columns:
-        left = n_columns - j
-        b_j, c_j = b + FLOAT * j, c + FLOAT * j
-        for i in range(0, whole, ROWS):
-            a_i, c_i = a + FLOAT * i * a_row, c_j + FLOAT * i * c_row
-            if left >= COLUMNS:
-                _tile_large(a_i, a_row, a_column, b_j, b_row, depth, c_i, c_row)
-            elif left >= 4:
-                _tile_4(a_i, a_row, a_column, b_j, b_row, depth, c_i, c_row)
-            else:
-                _tile_1(a_i, a_row, a_column, b_j, b_row, depth, c_i, c_row)
-        for i in range(whole, n_rows):
-            a_i, c_i = a + FLOAT * i * a_row, c_j + FLOAT * i * c_row
-            if left >= COLUMNS:
-                _row_large(a_i, a_row, a_column, b_j, b_row, depth, c_i, c_row)
-            elif left >= 4:
-                _row_4(a_i, a_row, a_column, b_j, b_row, depth, c_i, c_row)
-            else:
-                _row_1(a_i, a_row, a_column, b_j, b_row, depth, c_i, c_row)
-        j += COLUMNS if left >= COLUMNS else 4 if left >= 4 else 1
+        left, b_j, c_j = n_columns - j, b + FLOAT * j, c + FLOAT * j
+        if left >= 16:
+            _strip_of_16(a, a_row, a_column, b_j, b_row, c_j, c_row, n_rows, depth)
+            j += 16
+        elif left >= 4:
+            _strip_of_4(a, a_row, a_column, b_j, b_row, c_j, c_row, n_rows, depth)
+            j += 4
+        else:
+            _strip_of_1(a, a_row, a_column, b_j, b_row, c_j, c_row, n_rows, depth)
+            j += 1
 
 
 @njit(cache=True)
