@@ -121,10 +121,96 @@ def test_gradients_that_others_have_set_are_written_anew():
     stack = StackedMLP(3, [4, 6, 2])
     x, gradient = th.randn(3, 5, 4), th.randn(3, 5, 2)
     expected = th.autograd.grad(stack(x), stack.rest[0].weight, gradient)[0]
-    stack.rest[0].weight.grad = th.ones(3, 2, 6).transpose(1, 2)
+    theirs = th.ones(3, 2, 6)
+    stack.rest[0].weight.grad = theirs.transpose(1, 2)
+    stack.evaluate(x)
+    stack.backward(gradient)
+    close(theirs.transpose(1, 2), expected.double())
+
+
+@pytest.mark.skipif(not hasattr(th.Tensor, "grad_dtype"), reason="this PyTorch has gradients of the parameters' type alone")
+def test_gradients_may_be_of_another_type():
+    stack = StackedMLP(3, [4, 6, 2])
+    x, gradient = th.randn(3, 5, 4), th.randn(3, 5, 2)
+    expected = th.autograd.grad(stack(x), stack.rest[0].weight, gradient)[0]
+    stack.rest[0].weight.grad_dtype = th.float64
+    stack.rest[0].weight.grad = th.ones(3, 6, 2, dtype=th.float64)
     stack.evaluate(x)
     stack.backward(gradient)
     close(stack.rest[0].weight.grad, expected.double())
+
+
+@pytest.mark.parametrize("change", [th.nn.Module.half, th.nn.Module.double], ids=["half", "double"])
+def test_there_is_no_way_back_through_parameters_of_another_type(change):
+    stack = StackedMLP(8, [64, 64, 64, 8])
+    stack.evaluate(th.randn(8, 5, 64))
+    change(stack)
+    with pytest.raises(RuntimeError, match="evaluate 5 rows with these parameters before going back through them"):
+        stack.backward(th.randn(8, 5, 8))
+
+
+def test_there_is_no_way_back_without_an_evaluation():
+    one, other = StackedMLP(3, [4, 6, 2]), StackedMLP(3, [4, 6, 2])
+    other.borrow(one)
+    with pytest.raises(RuntimeError, match="evaluate 5 rows"):
+        one.backward(th.zeros(3, 5, 2))
+    other.evaluate(th.randn(3, 5, 4))  # makes an evaluation of the one, too, which has seen no input
+    with pytest.raises(ValueError, match=r"= \(3, 5, 4\) on cpu, got"):
+        one.backward(th.zeros(3, 5, 2))
+
+
+@pytest.mark.parametrize(
+    "lender", [{"sizes": [4, 4, 2]}, {"n_networks": 2}, {"common_input": True}, {"double": True}], ids=str
+)
+def test_tensors_of_another_kind_are_not_borrowed(lender):
+    lender = {"n_networks": 3, "sizes": [4, 6, 2], **lender}
+    double = lender.pop("double", False)
+    other, stack = StackedMLP(**lender), StackedMLP(3, [4, 6, 2])
+    stack.borrow(other.double() if double else other)
+    x = th.randn(3, 50, 4)
+    close(stack.evaluate(x), copy.deepcopy(stack).double()(x.double()).detach())
+
+
+def test_a_refused_input_leaves_the_latest_one():
+    stack = StackedMLP(3, [4, 6, 2])
+    x, gradient = th.randn(3, 5, 4), th.randn(3, 5, 2)
+    stack.evaluate(x)
+    with pytest.raises(ValueError, match="expected"):
+        stack.evaluate(x[:, :, :3])
+    stack.backward(gradient)
+    close(stack.first.weight.grad, th.autograd.grad(stack(x), stack.first.weight, gradient)[0].double())
+
+
+def test_an_input_that_has_shrunk_is_refused():
+    stack = StackedMLP(3, [4, 6, 2])
+    x = th.randn(3, 5, 4)
+    stack.evaluate(x)
+    x.data = th.empty(0)
+    with pytest.raises(ValueError, match=r"got \(0,\) on cpu"):
+        stack.backward(th.randn(3, 5, 2))
+
+
+def test_parameters_that_are_replaced_are_met_at_the_next_evaluation():
+    stack, x = StackedMLP(3, [4, 6, 6, 2]), th.randn(3, 5, 4)
+    stack.evaluate(x)
+    stack.rest[0].weight = nn.Parameter(th.randn(3, 6, 6))
+    close(stack.evaluate(x), copy.deepcopy(stack).double()(x.double()).detach())
+    stack.activation = nn.Tanh()
+    close(stack.evaluate(x), copy.deepcopy(stack).double()(x.double()).detach())
+
+
+@pytest.mark.parametrize("members", [[0, 5], [0, -1]])
+def test_members_without_a_network_are_refused(members):
+    with pytest.raises(ValueError, match="members name networks from 0 to 1; got"):
+        StackedMLP(2, [4, 6, 2], members=members)
+
+
+def test_sums_of_many_rows_are_as_exact_as_pytorch_s():
+    stack = StackedMLP(1, [1, 2, 1])
+    gradient = th.full((1, 100_000, 1), 0.1)
+    stack.evaluate(th.zeros(1, 100_000, 1))
+    stack.backward(gradient)
+    assert stack.rest[0].bias.grad.item() == pytest.approx(gradient.double().sum().item(), rel=1e-5)
 
 
 def test_what_is_not_a_number_stays_so():
@@ -139,11 +225,15 @@ def test_what_is_not_a_number_stays_so():
 def test_other_shapes_are_refused(shape):
     stack = StackedMLP(3, [4, 6, 2])
     evaluation = stack.evaluation(5)
-    with pytest.raises(ValueError, match=r"expected \(networks, rows, features\) = \(3, 5, 4\), got \(\d, \d, \d\)"):
+    with pytest.raises(
+        ValueError, match=r"expected \(networks, rows, features\) = \(3, 5, 4\) on cpu, got \(\d, \d, \d\) on cpu"
+    ):
         evaluation.first_layer(th.zeros(shape))
     stack.evaluate(th.randn(3, 5, 4))
-    with pytest.raises(ValueError, match=r"= \(3, 5, 2\), got \(3, 5, 1\)"):
+    with pytest.raises(ValueError, match=r"= \(3, 5, 2\) on cpu, got \(3, 5, 1\) on cpu"):
         stack.backward(th.zeros(3, 5, 1))
+    with pytest.raises(ValueError, match=r"on cpu, got .* on meta"):
+        stack.evaluate(th.zeros(3, 5, 4, device="meta"))
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ class Evaluation:
 
     :param stack: the networks
     :param batch: rows
-    :param lender: an evaluation of the same shape, whose tensors to use
+    :param lender: an evaluation whose tensors to use if they are of the same shape and type
     """
 
     def __init__(self, stack: StackedMLP, batch: int, lender: Evaluation | None = None) -> None:
@@ -36,9 +36,13 @@ class Evaluation:
         self.weights = [(weight.detach(), bias.detach()) for weight, bias in self.parameters]
         self.transposed = [weight.transpose(1, 2) for weight, _ in self.weights]
         self.first, self.first_bias = stack.first.weight.detach(), stack.first.bias.detach()
-        self.watched = [*stack.parameters(recurse=True)]
-        self.pointers = [parameter.data_ptr() for parameter in self.watched]
-        self.threads = th.get_num_threads()
+        self.activation, self.threads = stack.activation, th.get_num_threads()
+        self.watched = [
+            (module._parameters, name, parameter, parameter.data_ptr(), parameter.stride())
+            for module in stack.modules()
+            for name, parameter in module._parameters.items()
+            if parameter is not None
+        ]
         self.by_row = self.first.view(-1, self.width)
         self.common = None  # weight and bias of a common input, where they stand side by side
         if stack.common_input and self.wide_rows is None:
@@ -49,7 +53,8 @@ class Evaluation:
         self.normed: list[tuple[th.Tensor, th.Tensor]] = []  # by layer: rows before weight and bias; 1 / their deviations
         self.graphs: list[tuple[th.Tensor, th.Tensor]] = []  # of activations other than ReLU: what went in and what came out
         sizes = stack.sizes[1:]
-        if lender is None:
+        self.kind = (self.shape, batch, stack.sizes, stack.common_input, self.first.dtype, self.first.device)
+        if lender is None or lender.kind != self.kind:
             self.wide, first = self._first_layer()
             self.layers = [first, *(self.first.new_empty(*self.shape, size) for size in sizes[1:])]
             self.wide_gradient, first = self._first_layer()
@@ -68,27 +73,37 @@ class Evaluation:
         return wide, stack.spread(wide)
 
     def fits(self) -> bool:
-        """Whether it is for the parameters as they are (a module's ``to`` replaces their data), and as many threads."""
-        return list(map(th.Tensor.data_ptr, self.watched)) == self.pointers and th.get_num_threads() == self.threads
+        """Whether it is for the parameters as they are (a module's ``to`` replaces their data), and for as many threads."""
+        return (
+            th.get_num_threads() == self.threads
+            and self.stack._modules["activation"] is self.activation
+            and all(
+                store.get(name) is parameter and parameter.data_ptr() == pointer and parameter.stride() == strides
+                for store, name, parameter, pointer, strides in self.watched
+            )
+        )
 
     def first_layer(self, x: th.Tensor) -> th.Tensor:
         """
         :param x: as for :meth:`StackedMLP.forward`
         :return: (members, batch, hidden), pre-activations of the first layer, which may be changed before :meth:`rest`
         """
-        self.x = x = self._folded(x)
+        x = self._folded(x)
         if self.stack.common_input:
             weight, bias = self.common or self.stack.side_by_side(self.first, self.first_bias)
             th.addmm(bias, x[0], weight, out=self.wide)
         else:
-            self._first_of_own_inputs(x)
+            x = self._first_of_own_inputs(x)
+        self.x = x
         z = self._unfolded(self.layers[0])
         if self.member_bias is not None:
             z.add_(self.member_bias)
         return z
 
-    def _first_of_own_inputs(self, x: th.Tensor) -> None:
+    def _first_of_own_inputs(self, x: th.Tensor) -> th.Tensor:
+        """Evaluate it; returns the input as it was read."""
         self._layer(x, self.first, self.first_bias, self.wide)
+        return x
 
     def first_weights(self, rows: th.Tensor) -> th.Tensor:
         """

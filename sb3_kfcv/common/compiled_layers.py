@@ -25,7 +25,7 @@ LAYER = np.dtype(
     [
         (name, np.int64)
         for name in (
-            # Addresses and strides in numbers, of float32 tensors whose rows are contiguous. 0 is the address of nothing.
+            # Addresses, and strides counted in numbers, of float32 tensors whose rows are contiguous; address 0: nothing.
             *("x", "x_member", "x_row", "x_gradient"),  # what it reads, (members, rows, in), and its gradient
             *("z", "z_member", "z_row"),  # what it gives, (members, rows, out)
             *("z_gradient", "z_gradient_member", "z_gradient_row"),
@@ -44,6 +44,9 @@ FUSED = platform.machine().lower() in ("aarch64", "arm64") or bool(_FEATURES.get
 
 # Rows of a tile: eight vectors of sums keep the processor busy, and a row of 16 numbers is one vector or two.
 ROWS = 8 if _FEATURES.get("avx512f") else 4
+
+# Rows whose sum is one running sum.
+BLOCK = 128
 
 
 def _tile(n_rows: int, n_columns: int) -> Any:
@@ -184,7 +187,7 @@ def _fill(address, row, n_rows, n_columns, values):
 
 @njit(cache=True)
 def _rectify(address, row, n_rows, n_columns):
-    """ReLU in place; what is not a number stays so."""
+    """ReLU in place; what is not a number stays so, and -inf becomes one."""
     for i in range(n_rows):
         z = _numbers_at(address + FLOAT * i * row)
         for j in range(n_columns):
@@ -193,11 +196,30 @@ def _rectify(address, row, n_rows, n_columns):
 
 @njit(cache=True)
 def _through_rectifier(gradient, hidden, row, n_rows, n_columns):
-    """Turn the gradient behind a ReLU, whose outputs are given and lie alike, into the one before it."""
+    """Turn the gradient behind a ReLU, whose outputs are given and lie alike, into the one before it; it should be finite."""
     for i in range(n_rows):
         g, h = _numbers_at(gradient + FLOAT * i * row), _numbers_at(hidden + FLOAT * i * row)
         for j in range(n_columns):
             g[j] *= np.float32(not h[j] <= 0)
+
+
+@njit(cache=True)
+def _add_sums(rows, row, n_rows, n_columns, into, one, scratch):
+    """
+    Add the sums of columns; of many rows in blocks, so that a long sum does not swallow its last terms.
+
+    :param rows: of the matrix; ``row``: from row to row
+    :param into: added to, (n_columns,)
+    :param one: address of a one
+    :param scratch: of room for a row
+    """
+    sums, block = _numbers_at(into), _numbers_at(scratch)
+    for start in range(0, n_rows, BLOCK):
+        _fill(scratch, n_columns, 1, n_columns, 0)
+        first, length = rows + FLOAT * start * row, min(BLOCK, n_rows - start)
+        add_product(one, 0, 0, first, row, scratch, n_columns, 1, length, n_columns)
+        for j in range(n_columns):
+            sums[j] += block[j]
 
 
 @njit(cache=True)
@@ -209,7 +231,7 @@ def _transpose(matrix, n_rows, n_columns, into):
             written[j * n_rows + i] = read[i * n_columns + j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def forward(layers, members, n_rows, rectify_first):
     """
     Evaluate consecutive layers.
@@ -231,20 +253,21 @@ def forward(layers, members, n_rows, rectify_first):
             add_product(x, layer.x_row, 1, weight, layer.n_out, z, layer.z_row, n_rows, layer.n_in, layer.n_out)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True)
 def backward(layers, members, n_networks, n_rows, scratch):
     """
     Backpropagation from the last layer's ``z_gradient``: write the gradients of weights, biases and inputs where they have an
-    address. What a layer reads is taken to have come out of a ReLU, and its gradient becomes the one before that.
+    address. What a layer reads is taken to have come out of a ReLU if its gradient has an address, and that becomes the gradient
+    before the ReLU.
 
     :param layers: array of ``LAYER``, evaluated
     :param members: network of each member
     :param n_networks: number of networks
     :param n_rows: rows of each member
-    :param scratch: room for the largest weight of a network, and behind it a one
+    :param scratch: room for the largest ``n_out``, and ``n_in * n_out`` where there is an ``x_gradient``; and behind it a one
     """
-    transposed = scratch.ctypes.data
-    one = transposed + FLOAT * (len(scratch) - 1)
+    room = scratch.ctypes.data
+    one = room + FLOAT * (len(scratch) - 1)
     for layer in layers:
         if layer.weight_gradient:
             _fill(layer.weight_gradient, layer.n_out, n_networks * layer.n_in, layer.n_out, 0)
@@ -260,10 +283,10 @@ def backward(layers, members, n_networks, n_rows, scratch):
                 into = layer.weight_gradient + network * n_in * size
                 add_product(x, 1, layer.x_row, gradient, row, into, n_out, n_in, n_rows, n_out)
             if layer.bias_gradient:
-                add_product(one, 0, 0, gradient, row, layer.bias_gradient + network * size, n_out, 1, n_rows, n_out)
+                _add_sums(gradient, row, n_rows, n_out, layer.bias_gradient + network * size, one, room)
             if layer.x_gradient:
                 into = layer.x_gradient + FLOAT * member * layer.x_member
-                _transpose(layer.weight + network * n_in * size, n_in, n_out, transposed)
+                _transpose(layer.weight + network * n_in * size, n_in, n_out, room)
                 _fill(into, layer.x_row, n_rows, n_in, 0)
-                add_product(gradient, row, 1, transposed, n_in, into, layer.x_row, n_rows, n_out, n_in)
+                add_product(gradient, row, 1, room, n_in, into, layer.x_row, n_rows, n_out, n_in)
                 _through_rectifier(into, x, layer.x_row, n_rows, n_in)

@@ -127,7 +127,7 @@ class StackedMLP(nn.Module):
     :param members: network of each member; by default member i uses network i
     :param input_order: (members, in) order in which each member reads a common input; only with ``members``
     :param layer_norm: whether a layer norm stands before each activation
-    :raises ValueError: if ``layer_norm`` is neither yes nor no
+    :raises ValueError: if ``layer_norm`` is neither yes nor no, or a member uses a network that there is not
     """
 
     members: th.Tensor | None
@@ -148,6 +148,8 @@ class StackedMLP(nn.Module):
             raise ValueError(f"layer_norm is yes or no (True or False), not {layer_norm!r}")
         self.n_networks = n_networks
         self.n_members = n_networks if members is None else len(members)
+        if members is not None and not set(members) <= set(range(n_networks)):
+            raise ValueError(f"members name networks from 0 to {n_networks - 1}; got {list(members)}")
         self.common_input = common_input
         self.sizes = list(sizes)
         for size in sizes:
@@ -243,8 +245,12 @@ class StackedMLP(nn.Module):
         Write the gradients of the parameters into their ``grad``, from the latest :meth:`evaluate` of this batch size, once.
 
         :param gradient: of the loss, at its values (members, batch, out)
+        :raises RuntimeError: if there is none, or the parameters are no longer those of then
         """
-        self._evaluations[gradient.shape[1]].backward(gradient)
+        evaluation = self._evaluations.get(gradient.shape[1])
+        if evaluation is None or not evaluation.fits():
+            raise RuntimeError(f"evaluate {gradient.shape[1]} rows with these parameters before going back through them")
+        evaluation.backward(gradient)
 
     def evaluation(self, batch: int) -> Evaluation:
         """
@@ -267,10 +273,9 @@ class StackedMLP(nn.Module):
 
     def borrow(self, lender: StackedMLP) -> None:
         """
-        Evaluate in the tensors of another stack of the same shape, as a target network can: what is in use stays in the
-        processor's cache.
+        Evaluate in the tensors of another stack, as a target network can: what is in use stays in the processor's cache.
 
-        :param lender: the other stack; each one's evaluation overwrites the other's
+        :param lender: the other stack; if it is of the same shape and type, each one's evaluation overwrites the other's
         """
         self._lender = (lender,)
 
