@@ -257,8 +257,8 @@ def forward(layers, members, n_rows, rectify_first):
 def backward(layers, members, n_networks, n_rows, scratch):
     """
     Backpropagation from the last layer's ``z_gradient``: write the gradients of weights, biases and inputs where they have an
-    address. What a layer reads is taken to have come out of a ReLU if its gradient has an address, and that becomes the gradient
-    before the ReLU.
+    address. What a layer reads is taken to have come out of a ReLU if its gradient has an address, and that becomes the
+    gradient before the ReLU.
 
     :param layers: array of ``LAYER``, evaluated
     :param members: network of each member
