@@ -117,7 +117,7 @@ def test_frozen_parameters_get_no_gradient(frozen):
     assert [name for name, parameter in stack.named_parameters() if parameter.grad is None] == [f"{frozen}.weight"]
 
 
-def test_gradients_that_others_have_set_are_written_anew():
+def test_gradients_that_others_have_set_are_written_into():
     stack = StackedMLP(3, [4, 6, 2])
     x, gradient = th.randn(3, 5, 4), th.randn(3, 5, 2)
     expected = th.autograd.grad(stack(x), stack.rest[0].weight, gradient)[0]
