@@ -83,6 +83,16 @@ class Evaluation:
             )
         )
 
+    def values(self, x: th.Tensor) -> th.Tensor:
+        """
+        All layers.
+
+        :param x: as for :meth:`StackedMLP.forward`
+        :return: (members, batch, out)
+        """
+        self.first_layer(x)
+        return self.rest()
+
     def first_layer(self, x: th.Tensor) -> th.Tensor:
         """
         :param x: as for :meth:`StackedMLP.forward`

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,6 +46,10 @@ class CompiledEvaluation(Evaluation):
         room = [layer["n_in"] * layer["n_out"] for layer in self.plan[1:]]
         self.scratch = np.ones(max(*room, *self.plan["n_out"]) + 1, np.float32)
         self.after_first = self.plan[1:]
+        self.passed = self.after_first.copy()  # the same, where no gradients of parameters are wanted
+        self.learnt, self.learnt_parameters = self.after_first, self.parameters  # where they are
+        if not stack.common_input:
+            self.learnt, self.learnt_parameters = self.plan, [(stack.first.weight, stack.first.bias), *self.parameters]
 
     @staticmethod
     def serves(stack: StackedMLP) -> bool:
@@ -78,9 +81,21 @@ class CompiledEvaluation(Evaluation):
             raise ValueError(f"expected (networks, rows, features) = {expected}, got {got}")
         return values if values.dtype == th.float32 and values.stride(2) == 1 else values.float().contiguous()
 
-    def _first_of_own_inputs(self, x: th.Tensor) -> th.Tensor:
+    def values(self, x: th.Tensor) -> th.Tensor:
+        if self.stack.common_input or self.member_bias is not None:
+            return super().values(x)
+        self.x = self._given(self._folded(x))
+        forward(self.plan, self.numbers, self.shape[1], False)
+        return self._unfolded(self.layers[-1])
+
+    def _given(self, x: th.Tensor) -> th.Tensor:
+        """Note where the own inputs lie; returns them as they are read."""
         x = self._readable(x, self.stack.sizes[0])
         self._lie(self.plan[0], "x", x)
+        return x
+
+    def _first_of_own_inputs(self, x: th.Tensor) -> th.Tensor:
+        x = self._given(x)
         forward(self.plan[:1], self.numbers, self.shape[1], False)
         return x
 
@@ -89,28 +104,31 @@ class CompiledEvaluation(Evaluation):
         return self._unfolded(self.layers[-1])
 
     def _through_layers(self, gradient: th.Tensor, parameters: bool) -> None:
+        """Where the parameters' gradients are wanted, a first layer of own inputs is gone through with the others."""
         gradient = self._readable(gradient, self.stack.sizes[-1])
-        self._lie(self.plan[-1], "z_gradient", gradient)
-        self._backward(self.after_first, self.parameters if parameters else [])
+        layers = self.learnt if parameters else self.passed
+        self._lie(layers[-1], "z_gradient", gradient)
+        apart = self._place_gradients() if parameters else []
+        if layers is self.plan:
+            self.x = self._given(self.x)  # it may have been given another place since
+        backward(layers, self.numbers, self.stack.n_networks, self.shape[1], self.scratch)
+        for into, written in apart:
+            into.copy_(written)
 
     def _write_first_of_own_inputs(self, gradient: th.Tensor) -> None:
-        x = self._readable(self.x, self.stack.sizes[0])  # it may have been given another place since
-        self._lie(self.plan[0], "x", x)
-        self._backward(self.plan[:1], [(self.stack.first.weight, self.stack.first.bias)])
+        """Done with the others."""
 
-    def _backward(self, layers: np.ndarray, parameters: Sequence[tuple[nn.Parameter, nn.Parameter]]) -> None:
-        """Through some layers; ``parameters``: theirs, or none if their gradients are not wanted."""
+    def _place_gradients(self) -> list[tuple[th.Tensor, th.Tensor]]:
+        """Note where the parameters' gradients are to be written; those that cannot be, with what is to be copied there."""
         apart = []
-        layers["weight_gradient"] = layers["bias_gradient"] = 0
-        for layer, own in zip(layers, parameters, strict=False):
+        for layer, own in zip(self.learnt, self.learnt_parameters, strict=True):
             for name, parameter in zip(("weight_gradient", "bias_gradient"), own, strict=True):
                 if (into := gradient_of(parameter)) is None:
+                    layer[name] = 0
                     continue
                 written = into
                 if into.dtype != th.float32 or not (into.is_cpu and into.is_contiguous()):  # set by somebody else
                     written = th.empty(parameter.shape)
                     apart.append((into, written))
                 layer[name] = written.data_ptr()
-        backward(layers, self.numbers, self.stack.n_networks, self.shape[1], self.scratch)
-        for into, written in apart:
-            into.copy_(written)
+        return apart

@@ -236,9 +236,7 @@ class StackedMLP(nn.Module):
         :param x: as for :meth:`forward`
         :return: (members, batch, out), overwritten by the next evaluation
         """
-        evaluation = self.evaluation(x.shape[1])
-        evaluation.first_layer(x)
-        return evaluation.rest()
+        return self.evaluation(x.shape[1]).values(x)
 
     def backward(self, gradient: th.Tensor) -> None:
         """

@@ -293,9 +293,9 @@ class MADDPG(JointAlgorithm):
         self.actor_target = self.policy.actor_target
         self.critic = self.policy.critic
         self.critic_target = self.policy.critic_target
-        networks = (self.actor, self.actor_target, self.critic, self.critic_target)
         # Asked for at every update, and slow to gather.
-        self._parameters: dict[nn.Module, list[th.Tensor]] = {network: list(network.parameters()) for network in networks}
+        self._parameters: list[th.Tensor] = [*self.critic.parameters(), *self.actor.parameters()]
+        self._target_parameters: list[th.Tensor] = [*self.critic_target.parameters(), *self.actor_target.parameters()]
 
     @without_denormals()
     @th.no_grad()
@@ -340,8 +340,7 @@ class MADDPG(JointAlgorithm):
                 self._watch.actors(actor_losses, own_actions)
 
                 # θ' ← τθ + (1 − τ)θ'
-                self._follow(self.critic_target, self.critic)
-                self._follow(self.actor_target, self.actor)
+                th._foreach_lerp_(self._target_parameters, self._parameters, self.tau)
 
             if self.replay_buffer.uses_td_errors:
                 self.replay_buffer.update_priorities(batch.rows, (errors[0].abs() * shares(live, dim=0)).sum(0))
@@ -402,10 +401,6 @@ class MADDPG(JointAlgorithm):
         if self._opponent_policy is not None:
             actions = self._opponent_policy.expected_rows(actions, observations, self.policy)
         return actions
-
-    def _follow(self, targets: nn.Module, networks: nn.Module) -> None:
-        """θ' ← τθ + (1 − τ)θ'"""
-        th._foreach_lerp_(self._parameters[targets], self._parameters[networks], self.tau)
 
     def _check_losses(self, quantity: str, losses: th.Tensor) -> None:
         """
@@ -555,6 +550,7 @@ class MADDPG(JointAlgorithm):
             "_learning",
             "_agent_of_column",
             "_parameters",
+            "_target_parameters",
             "teacher_input_size",
         ]  # made anew of the settings
         return super()._excluded_save_params() + excluded
