@@ -8,7 +8,7 @@ import torch as th
 from torch import nn
 
 from sb3_kfcv.common.backpropagation import Evaluation
-from sb3_kfcv.common.compiled_backpropagation import WIDEST, CompiledEvaluation
+from sb3_kfcv.common.compiled_backpropagation import WIDEST, WIDEST_COMMON_INPUT, CompiledEvaluation
 from sb3_kfcv.common.compiled_layers import add_product
 from sb3_kfcv.common.stacked_networks import StackedMLP
 
@@ -63,7 +63,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("batch", [1, 13, 128])
-@pytest.mark.parametrize("sizes", [[5, 7, 6, 2], [24, 64, 64, 5], [3, 20, 1]], ids=str)
+@pytest.mark.parametrize("sizes", [[5, 7, 6, 2], [24, 64, 64, 5], [3, 20, 1], [WIDEST_COMMON_INPUT // 4 + 1, 9, 2]], ids=str)
 @pytest.mark.parametrize("kind", KINDS)
 def test_evaluation_and_backward_are_those_of_autograd(kind, sizes, batch):
     """Twice, with other inputs: nothing of the first evaluation is left in the tensors that the second uses again."""
@@ -79,6 +79,33 @@ def test_evaluation_and_backward_are_those_of_autograd(kind, sizes, batch):
         stack.backward(gradient)
         for parameter, theirs in zip(stack.parameters(), expected, strict=True):
             close(parameter.grad, theirs)
+
+
+@pytest.mark.parametrize("batch", [1, 128])
+@pytest.mark.parametrize("sizes", [[5, 7, 6, 2], [WIDEST_COMMON_INPUT // 4 + 1, 9, 2]], ids=str)
+@pytest.mark.parametrize("kind", KINDS)
+def test_least_squares_are_those_of_autograd(kind, sizes, batch):
+    stack = StackedMLP(4, sizes, **KINDS[kind])
+    exact = copy.deepcopy(stack).double()
+    for _ in range(2):
+        x = th.randn(1 if stack.common_input else stack.n_members, batch, sizes[0])
+        # As the learner has them: columns of what lies by rows.
+        targets, weights = (th.rand(batch, 2, stack.n_members).permute(2, 0, 1) for _ in range(2))
+        errors, losses = stack.regress(x, targets, weights / batch)
+        theirs = targets - exact(x.double())
+        squares = (weights / batch * theirs.square()).sum(1)
+        expected = th.autograd.grad(squares.sum(), list(exact.parameters()))
+        close(errors, theirs.detach())
+        close(losses, squares.detach())
+        for parameter, gradient in zip(stack.parameters(), expected, strict=True):
+            close(parameter.grad, gradient)
+
+
+@pytest.mark.parametrize("changed", ["targets", "weights"])
+def test_targets_and_weights_of_another_shape_are_refused(changed):
+    given = {"targets": th.zeros(3, 5, 2), "weights": th.ones(3, 5, 2), changed: th.zeros(3, 4, 2)}
+    with pytest.raises(ValueError, match=r"expected \(3, 5, 2\) on cpu, got \(3, 4, 2\) on cpu"):
+        StackedMLP(3, [4, 6, 2]).regress(th.zeros(3, 5, 4), **given)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -478,6 +478,35 @@ def test_own_action_replaced_equals_a_plain_evaluation_and_its_gradient(layout, 
         close(gradients[i], new[i].grad, atol=1e-5)
 
 
+@NORMS
+@pytest.mark.parametrize("share", [False, True])
+@pytest.mark.parametrize("agents", [None, [1, 3]], ids=["", "a team"])
+def test_both_steps_are_those_of_autograd(layout, agents, share, layer_norm):
+    """Eq. 5 of two critics per agent, and eq. 6 at the same inputs, whether compiled or not."""
+    agents = list(range(layout.n_agents)) if agents is None else [agent for agent in agents if agent < layout.n_agents]
+    critics = critics_of(layout, agents=agents, n_critics=2, share_parameters=share, layer_norm=layer_norm)
+    exact = copy.deepcopy(critics).double()
+    inputs = th.randn(7, sum(layout.obs_sizes) + sum(layout.action_sizes))
+    targets, weights = th.randn(7, len(agents)).T, th.rand(7, len(agents)).T
+    errors, losses = critics.regress(inputs, targets, weights)
+    theirs = targets - exact(inputs.double())
+    squares = (weights * theirs.square()).sum(-1)
+    close(errors, theirs.detach().float(), atol=1e-5)
+    close(losses, squares.detach().float(), atol=1e-4)
+    for parameter, gradient in zip(
+        critics.parameters(), th.autograd.grad(squares.sum(), list(exact.parameters())), strict=True
+    ):
+        close(parameter.grad, gradient.float(), atol=1e-4)
+
+    own = [th.randn(len(block.agents), 7, block.action_size) for block in critics.blocks]
+    exact.evaluate(inputs.double())
+    q_values = exact.evaluate_own_actions([actions.double() for actions in own])
+    losses, gradients = critics.ascend(own, weights)
+    close(losses, -(q_values * weights).sum(-1).float(), atol=1e-4)
+    for gradient, expected in zip(gradients, exact.own_action_gradients(-weights.double()), strict=True):
+        close(gradient, expected.float(), atol=1e-5)
+
+
 def test_own_action_replaced_for_some_of_the_agents():
     """A team: agents 1 and 3 learn; the critics still read everyone's actions."""
     layout = LAYOUTS["several blocks"]

@@ -22,15 +22,19 @@ class Evaluation:
 
     :param stack: the networks
     :param batch: rows
-    :param lender: an evaluation whose tensors to use if they are of the same shape and type
+    :param lender: an evaluation whose tensors to use if it is of the same kind, for networks of the same shape and type
     """
+
+    folding = True  # whether rows of members that share a network are one longer minibatch of it, where they can be
+    whole = False  # whether the first layer of all members on a common input is one of many, not one product
 
     def __init__(self, stack: StackedMLP, batch: int, lender: Evaluation | None = None) -> None:
         self.stack, self.batch = stack, batch
         self.relu = type(stack.activation) is nn.ReLU
-        self.members, self.wide_rows, self.width = None if stack.folds else stack.members, stack.wide_rows, stack.sizes[1]
+        self.folds = stack.folds and self.folding
+        self.members, self.wide_rows, self.width = None if self.folds else stack.members, stack.wide_rows, stack.sizes[1]
         self.shape = (stack.n_members, batch)
-        if stack.folds:
+        if self.folds:
             self.shape = (stack.n_networks, stack.n_members // stack.n_networks * batch)
         self.parameters: list[tuple[nn.Parameter, nn.Parameter]] = [(layer.weight, layer.bias) for layer in stack.rest]  # type: ignore[misc]
         self.weights = [(weight.detach(), bias.detach()) for weight, bias in self.parameters]
@@ -53,7 +57,16 @@ class Evaluation:
         self.normed: list[tuple[th.Tensor, th.Tensor]] = []  # by layer: rows before weight and bias; 1 / their deviations
         self.graphs: list[tuple[th.Tensor, th.Tensor]] = []  # of activations other than ReLU: what went in and what came out
         sizes = stack.sizes[1:]
-        self.kind = (self.shape, batch, stack.sizes, stack.common_input, self.first.dtype, self.first.device)
+        self.kind = (
+            type(self),
+            self.whole,
+            self.shape,
+            batch,
+            stack.sizes,
+            stack.common_input,
+            self.first.dtype,
+            self.first.device,
+        )
         if lender is None or lender.kind != self.kind:
             self.wide, first = self._first_layer()
             self.layers = [first, *(self.first.new_empty(*self.shape, size) for size in sizes[1:])]
@@ -66,7 +79,7 @@ class Evaluation:
     def _first_layer(self) -> tuple[th.Tensor, th.Tensor]:
         """For the first layer, and viewed as those of the others; with a common input its members stand side by side."""
         stack = self.stack
-        if not stack.common_input:
+        if not stack.common_input or self.whole:
             z = self.first.new_empty(*self.shape, self.width)
             return z, z
         wide = self.first.new_empty(self.batch, stack.n_members * self.width)
@@ -103,17 +116,12 @@ class Evaluation:
             weight, bias = self.common or self.stack.side_by_side(self.first, self.first_bias)
             th.addmm(bias, x[0], weight, out=self.wide)
         else:
-            x = self._first_of_own_inputs(x)
+            self._layer(x, self.first, self.first_bias, self.wide)
         self.x = x
         z = self._unfolded(self.layers[0])
         if self.member_bias is not None:
             z.add_(self.member_bias)
         return z
-
-    def _first_of_own_inputs(self, x: th.Tensor) -> th.Tensor:
-        """Evaluate it; returns the input as it was read."""
-        self._layer(x, self.first, self.first_bias, self.wide)
-        return x
 
     def first_weights(self, rows: th.Tensor) -> th.Tensor:
         """
@@ -135,6 +143,21 @@ class Evaluation:
                 self._norm(i)
             self._layer(self._activate(self.layers[i]), weight, bias, self.layers[i + 1])
         return self._unfolded(self.layers[-1])
+
+    def regress(self, x: th.Tensor, targets: th.Tensor, weights: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        The losses Σ weights · (targets − values)², summed over the rows, and their gradients into the parameters' ``grad``.
+
+        :param x: as for :meth:`StackedMLP.forward`
+        :param targets: (members, batch, out)
+        :param weights: of each, (members, batch, out)
+        :return: the errors, targets − values (members, batch, out); the losses (members, out)
+        """
+        errors = targets - self.values(x)
+        weighted = errors * weights
+        losses = (weighted * errors).sum(1)
+        self.backward(weighted.mul_(-2))
+        return errors, losses
 
     def backward(self, gradient: th.Tensor, parameters: bool = True) -> th.Tensor:
         """
@@ -165,10 +188,10 @@ class Evaluation:
 
     def _folded(self, values: th.Tensor) -> th.Tensor:
         """(members, batch, …) → (networks, rows, …)."""
-        return values.reshape(*self.shape, values.shape[2]) if self.stack.folds else values
+        return values.reshape(*self.shape, values.shape[2]) if self.folds else values
 
     def _unfolded(self, values: th.Tensor) -> th.Tensor:
-        return values.view(self.stack.n_members, self.batch, values.shape[2]) if self.stack.folds else values
+        return values.view(self.stack.n_members, self.batch, values.shape[2]) if self.folds else values
 
     def _layer(self, x: th.Tensor, weight: th.Tensor, bias: th.Tensor, out: th.Tensor) -> None:
         if self.members is not None:
@@ -195,7 +218,7 @@ class Evaluation:
     def _write_first_gradients(self) -> None:
         stack, gradient = self.stack, self.gradients[0]
         if not stack.common_input:
-            self._write_first_of_own_inputs(gradient)
+            self._write_gradients(self.x, gradient, stack.first.weight, stack.first.bias)  # type: ignore[arg-type]
         else:
             if (into := gradient_of(stack.first.weight)) is not None:
                 if self.wide_rows is None:
@@ -210,9 +233,6 @@ class Evaluation:
                     into.zero_().view(-1, self.width).index_add_(0, stack.members, gradient.sum(1))  # type: ignore[arg-type]
         if stack.member_bias is not None and (into := gradient_of(stack.member_bias)) is not None:
             th.sum(self._unfolded(gradient), dim=1, keepdim=True, out=into)
-
-    def _write_first_of_own_inputs(self, gradient: th.Tensor) -> None:
-        self._write_gradients(self.x, gradient, self.stack.first.weight, self.stack.first.bias)
 
     def _scale(self, i: int) -> tuple[th.Tensor, th.Tensor]:
         """Weight and bias of the i-th norm, by row of its input."""

@@ -18,7 +18,7 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-FLOAT = 4
+FLOAT, INTEGER = 4, 8
 """Bytes of a number."""
 
 LAYER = np.dtype(
@@ -30,12 +30,19 @@ LAYER = np.dtype(
             *("z", "z_member", "z_row"),  # what it gives, (members, rows, out)
             *("z_gradient", "z_gradient_member", "z_gradient_row"),
             *("weight", "bias", "weight_gradient", "bias_gradient"),  # (networks, in, out) and (networks, 1, out)
+            "weight_rows",  # int64 (members, in): where in the weights, seen as rows (…, out), those of each input stand
+            *("member_bias", "member_bias_gradient"),  # (members, 1, out), beside the network's
             *("n_in", "n_out"),
         )
     ]
 )
 """A layer of a stack. The gradient of what it reads lies as that itself does."""
 
+OWN_INPUTS = np.dtype([(name, np.int64) for name in ("values", "gradient", "column", "size")])
+"""
+Of a member: the addresses of its own inputs (rows, size), which stand in place of those in the common input from a column on,
+and of their gradient.
+"""
 
 _FEATURES = llvm.get_host_cpu_features()
 
@@ -128,12 +135,12 @@ def _strip(n_columns: int) -> Any:
 _strip_of_16, _strip_of_4, _strip_of_1 = (_strip(columns) for columns in (16, 4, 1))
 
 
-def _reader() -> Any:
+def _reader(kind: types.Type) -> Any:
     """The function that gives the numbers at an address, to be indexed."""
 
     @intrinsic
     def numbers_at(typing_context, address):  # type: ignore[no-untyped-def]
-        signature = types.CPointer(types.float32)(types.int64)
+        signature = types.CPointer(kind)(types.int64)
 
         def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
             return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
@@ -143,7 +150,7 @@ def _reader() -> Any:
     return numbers_at
 
 
-_numbers_at = _reader()
+_numbers_at, _integers_at = _reader(types.float32), _reader(types.int64)
 
 
 @njit(cache=True)
@@ -232,7 +239,35 @@ def _transpose(matrix, n_rows, n_columns, into):
 
 
 @njit(cache=True)
-def forward(layers, members, n_rows, rectify_first):
+def _gather_rows(matrix, rows, n_rows, n_columns, into):
+    """Some rows of a contiguous matrix, by their numbers."""
+    read, written, numbers = _numbers_at(matrix), _numbers_at(into), _integers_at(rows)
+    for i in range(n_rows):
+        start = numbers[i] * n_columns
+        for j in range(n_columns):
+            written[i * n_columns + j] = read[start + j]
+
+
+@njit(cache=True)
+def _add_to_rows(matrix, rows, n_rows, n_columns, added):
+    """Add a contiguous matrix to some rows of another one, by their numbers."""
+    written, read, numbers = _numbers_at(matrix), _numbers_at(added), _integers_at(rows)
+    for i in range(n_rows):
+        start = numbers[i] * n_columns
+        for j in range(n_columns):
+            written[start + j] += read[i * n_columns + j]
+
+
+@njit(cache=True)
+def _add(numbers, added, n):
+    """Add numbers to others."""
+    written, read = _numbers_at(numbers), _numbers_at(added)
+    for i in range(n):
+        written[i] += read[i]
+
+
+@njit(cache=True)
+def forward(layers, members, n_rows, rectify_first, scratch):
     """
     Evaluate consecutive layers.
 
@@ -240,7 +275,9 @@ def forward(layers, members, n_rows, rectify_first):
     :param members: network of each member
     :param n_rows: rows of each member
     :param rectify_first: whether what the first layer reads is to go through a ReLU, as what all others read
+    :param scratch: room for a row of each layer, and for the weights of one with ``weight_rows``
     """
+    room = scratch.ctypes.data
     for member, network in enumerate(members):
         for i in range(len(layers)):
             layer = layers[i]
@@ -248,8 +285,16 @@ def forward(layers, members, n_rows, rectify_first):
             size = FLOAT * layer.n_out
             if i > 0 or rectify_first:
                 _rectify(x, layer.x_row, n_rows, layer.n_in)
-            _fill(z, layer.z_row, n_rows, layer.n_out, layer.bias + network * size)
+            bias = layer.bias + network * size
+            if layer.member_bias:
+                _fill(room, layer.n_out, 1, layer.n_out, bias)
+                _add(room, layer.member_bias + member * size, layer.n_out)
+                bias = room
+            _fill(z, layer.z_row, n_rows, layer.n_out, bias)
             weight = layer.weight + network * layer.n_in * size
+            if layer.weight_rows:
+                _gather_rows(layer.weight, layer.weight_rows + INTEGER * member * layer.n_in, layer.n_in, layer.n_out, room)
+                weight = room
             add_product(x, layer.x_row, 1, weight, layer.n_out, z, layer.z_row, n_rows, layer.n_in, layer.n_out)
 
 
@@ -264,7 +309,8 @@ def backward(layers, members, n_networks, n_rows, scratch):
     :param members: network of each member
     :param n_networks: number of networks
     :param n_rows: rows of each member
-    :param scratch: room for the largest ``n_out``, and ``n_in * n_out`` where there is an ``x_gradient``; and behind it a one
+    :param scratch: room for the largest ``n_out``, and for ``n_in * n_out`` where there is an ``x_gradient`` or
+        ``weight_rows``, and behind it a one
     """
     room = scratch.ctypes.data
     one = room + FLOAT * (len(scratch) - 1)
@@ -281,12 +327,110 @@ def backward(layers, members, n_networks, n_rows, scratch):
             gradient, row = layer.z_gradient + FLOAT * member * layer.z_gradient_member, layer.z_gradient_row
             if layer.weight_gradient:
                 into = layer.weight_gradient + network * n_in * size
+                if layer.weight_rows:
+                    _fill(room, n_out, n_in, n_out, 0)
+                    into = room
                 add_product(x, 1, layer.x_row, gradient, row, into, n_out, n_in, n_rows, n_out)
+                if layer.weight_rows:
+                    _add_to_rows(layer.weight_gradient, layer.weight_rows + INTEGER * member * n_in, n_in, n_out, room)
             if layer.bias_gradient:
                 _add_sums(gradient, row, n_rows, n_out, layer.bias_gradient + network * size, one, room)
+            if layer.member_bias_gradient:
+                into = layer.member_bias_gradient + member * size
+                _fill(into, n_out, 1, n_out, 0)
+                _add_sums(gradient, row, n_rows, n_out, into, one, room)
             if layer.x_gradient:
                 into = layer.x_gradient + FLOAT * member * layer.x_member
                 _transpose(layer.weight + network * n_in * size, n_in, n_out, room)
                 _fill(into, layer.x_row, n_rows, n_in, 0)
                 add_product(gradient, row, 1, room, n_in, into, layer.x_row, n_rows, n_out, n_in)
                 _through_rectifier(into, x, layer.x_row, n_rows, n_in)
+
+
+@njit(cache=True)
+def regress(layers, members, n_networks, n_rows, fit, scratch):
+    """
+    Evaluate, and go back from the losses Σ weights · (targets − values)², summed over the rows.
+
+    :param layers: array of ``LAYER``, all of a stack; the last one's ``z_gradient`` is written
+    :param members: network of each member
+    :param n_networks: number of networks
+    :param n_rows: rows of each member
+    :param fit: targets and their weights (members, rows, out); where the errors, targets − values, are written (members, rows,
+        out), and where the losses (members, out)
+    :param scratch: as for :func:`forward` and :func:`backward`
+    """
+    targets, weights, errors, losses = fit
+    forward(layers, members, n_rows, False, scratch)
+    last = layers[len(layers) - 1]
+    for member in range(len(members)):
+        for k in range(last.n_out):
+            loss = 0.0
+            for i in range(n_rows):
+                value = _numbers_at(last.z + FLOAT * (member * last.z_member + i * last.z_row))[k]
+                gradient = _numbers_at(last.z_gradient + FLOAT * (member * last.z_gradient_member + i * last.z_gradient_row))
+                error = targets[member, i, k] - value
+                weighted = error * weights[member, i, k]
+                errors[member, i, k] = error
+                gradient[k] = np.float32(-2) * weighted
+                loss += weighted * error
+            losses[member, k] = loss
+    backward(layers, members, n_networks, n_rows, scratch)
+
+
+@njit(cache=True)
+def ascend(layers, members, n_networks, n_rows, climb, scratch):
+    """
+    Evaluate with own inputs, and go back to them from the losses −Σ weights · values, summed over the rows, of one value each.
+
+    The first layer is computed as for the common input; own inputs move it by (new − old) · (their weights).
+
+    :param layers: array of ``LAYER``, all of a stack, the first with ``weight_rows``; the last one's ``z_gradient`` is written
+    :param members: network of each member
+    :param n_networks: number of networks
+    :param n_rows: rows of each member
+    :param climb: array of ``OWN_INPUTS`` (members,); weight of each value (members, rows); where the losses are written
+        (members,); room for the widest own inputs times (2 hidden + rows)
+    :param scratch: as for :func:`forward` and :func:`backward`
+    """
+    own_inputs, weights, losses, room = climb
+    first, rest = layers[0], layers[1:]
+    hidden = first.n_out
+    widest = room.size // (2 * hidden + n_rows)
+    own_weights = room.ctypes.data
+    transposed = own_weights + FLOAT * hidden * widest
+    moved = transposed + FLOAT * hidden * widest
+
+    forward(layers[:1], members, n_rows, False, scratch)
+    for member in range(len(members)):
+        own = own_inputs[member]
+        rows = first.weight_rows + INTEGER * (member * first.n_in + own.column)
+        _gather_rows(first.weight, rows, own.size, hidden, own_weights)
+        new, difference = _numbers_at(own.values), _numbers_at(moved)
+        for i in range(n_rows):
+            old = _numbers_at(first.x + FLOAT * (member * first.x_member + i * first.x_row + own.column))
+            for j in range(own.size):
+                difference[i * own.size + j] = new[i * own.size + j] - old[j]
+        z = first.z + FLOAT * member * first.z_member
+        add_product(moved, own.size, 1, own_weights, hidden, z, first.z_row, n_rows, own.size, hidden)
+    forward(rest, members, n_rows, True, scratch)
+
+    last = layers[len(layers) - 1]
+    for member in range(len(members)):
+        loss = 0.0
+        for i in range(n_rows):
+            value = _numbers_at(last.z + FLOAT * (member * last.z_member + i * last.z_row))[0]
+            gradient = _numbers_at(last.z_gradient + FLOAT * (member * last.z_gradient_member + i * last.z_gradient_row))
+            loss -= weights[member, i] * value
+            gradient[0] = -weights[member, i]
+        losses[member] = loss
+    backward(rest, members, n_networks, n_rows, scratch)
+
+    for member in range(len(members)):
+        own = own_inputs[member]
+        rows = first.weight_rows + INTEGER * (member * first.n_in + own.column)
+        _gather_rows(first.weight, rows, own.size, hidden, own_weights)
+        _transpose(own_weights, own.size, hidden, transposed)
+        _fill(own.gradient, own.size, n_rows, own.size, 0)
+        at_first, row = first.z_gradient + FLOAT * member * first.z_gradient_member, first.z_gradient_row
+        add_product(at_first, row, 1, transposed, own.size, own.gradient, own.size, n_rows, hidden, own.size)

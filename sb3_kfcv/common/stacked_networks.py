@@ -250,6 +250,18 @@ class StackedMLP(nn.Module):
             raise RuntimeError(f"evaluate {gradient.shape[1]} rows with these parameters before going back through them")
         evaluation.backward(gradient)
 
+    def regress(self, x: th.Tensor, targets: th.Tensor, weights: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Least squares: write the gradients of Σ weights · (targets − values)² into the parameters' ``grad``, as
+        :meth:`evaluate` and :meth:`backward` would.
+
+        :param x: as for :meth:`forward`
+        :param targets: (members, batch, out)
+        :param weights: of each, (members, batch, out)
+        :return: the errors, targets − values (members, batch, out), and the losses, summed over the rows (members, out)
+        """
+        return self.evaluation(x.shape[1]).regress(x, targets, weights)
+
     def evaluation(self, batch: int) -> Evaluation:
         """
         The place of evaluations of this size; its tensors are those of the latest one.

@@ -79,10 +79,8 @@ class Teachers:
         for _ in range(steps):
             drawn = np.stack([rows[rng.integers(len(rows), size=batch_size)] for rows in rows_per_fold])  # (folds, batch)
             picked = th.as_tensor(drawn, device=inputs.device)
-            errors = targets[picked] - self.values(inputs[picked]).transpose(1, 2)  # (folds, batch, agents)
-            weighted = errors * shares(live[picked], dim=1)
-            losses.append((weighted * errors).sum(1).mean())
-            self.stack.backward(weighted.mul_(-2))
+            _, loss = self.stack.regress(inputs[picked], targets[picked], shares(live[picked], dim=1))  # (folds, agents)
+            losses.append(loss.mean())
             self.optimizer.step()
         return th.stack(losses[-max(steps // 10, 1) :]).mean().item()
 

@@ -322,20 +322,17 @@ class MADDPG(JointAlgorithm):
             # Eq. 5: minimise (y − Q)², y = r + γ Q'(s', a'_1 … a'_N)
             inputs = self._critic_inputs(batch.observations, batch.states, self.policy.encode(batch.actions), batch.alive)
             targets = self.td_target(batch)  # (agents, batch)
-            errors = targets - self.critic.evaluate(inputs)  # (critics, agents, batch)
-            weighted = errors * (share * batch.weights)
-            critic_losses = (weighted * errors).sum(-1)  # (critics, agents)
+            errors, critic_losses = self.critic.regress(inputs, targets, share * batch.weights)
             self._check_losses("critic loss", critic_losses)
-            self.critic.backward(weighted.mul_(-2))
             self._step(self.critic)
 
             # Eq. 6: ascend Q(s, a_1 … π_i(o_i) … a_N)
             if self._n_updates % self.policy_delay == 0:
                 own_actions = self.actor.evaluate(batch.observations, self.gumbel_temperature)
-                actor_losses = -(self.critic.evaluate_own_actions(own_actions) * share).sum(-1)  # (agents,)
+                actor_losses, gradients = self.critic.ascend(own_actions, share)
                 self._check_losses("actor loss", actor_losses)
                 penalties = self.actor_regularization * share if self.actor_regularization > 0 else None
-                self.actor.backward(self.critic.own_action_gradients(-share), penalties)
+                self.actor.backward(gradients, penalties)
                 self._step(self.actor)
                 self._watch.actors(actor_losses, own_actions)
 

@@ -17,6 +17,7 @@ from sb3_kfcv.common.actors import ActorPolicy, Block, StackedActors, by_agent, 
 from sb3_kfcv.common.adam import LeanAdam
 from sb3_kfcv.common.backpropagation import Evaluation
 from sb3_kfcv.common.checks import require_count
+from sb3_kfcv.common.compiled_backpropagation import CompiledEvaluation
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.stacked_networks import StackedMLP, at_most
 from sb3_kfcv.saving.archive import open_archive, write_archive
@@ -61,6 +62,7 @@ class CentralCritics(nn.Module):
         self.blocks = Block.split(layout, agents)
         self.order = ego_order(layout, agents, critic_input) if share_parameters else None  # (agents, input)
         self.positions = self._runs()
+        self.n_runs = len(self.positions)
         self.stacks = nn.ModuleList()
         for _ in range(n_critics):
             for run, positions in enumerate(self.positions):
@@ -75,6 +77,9 @@ class CentralCritics(nn.Module):
             run = next(r for r, positions in enumerate(self.positions) if block.positions[0] in positions)
             self._places.append((run, None if block.positions == self.positions[run] else block.positions))
             self.register_buffer(f"_own_rows_{i}", self._own_rows(i, block), persistent=False)
+        # Of each block: the agents' places, and where in the joint input their own actions begin
+        starts = [self.actions_start + block.action_columns.index[:, 0] for block in self.blocks]
+        self._own_columns = [(block.positions, own.tolist()) for block, own in zip(self.blocks, starts, strict=True)]
         self._inputs: list[th.Tensor] = []  # of the latest evaluation
         # Of the latest evaluation of own actions: the stacks' evaluations, and per block the weights of the own action
         self._moved: list[Evaluation] = []
@@ -104,20 +109,44 @@ class CentralCritics(nn.Module):
         return self._by_critic([stack(read) for stack, read in zip(self.stacks, self._reads(inputs), strict=True)])
 
     def evaluate(self, inputs: th.Tensor) -> th.Tensor:
-        """As :meth:`forward`, and remembered for :meth:`backward`; overwritten by the next evaluation."""
+        """As :meth:`forward`, and remembered for :meth:`ascend`; overwritten by the next evaluation."""
         self._inputs[:] = [inputs]
         reads = self._reads(inputs)
         return self._by_critic([stack.evaluate(read) for stack, read in zip(self.stacks, reads, strict=True)])  # type: ignore[operator]
 
-    def backward(self, gradients: th.Tensor) -> None:
+    def regress(self, inputs: th.Tensor, targets: th.Tensor, weights: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
-        Write the gradients of the parameters, from the latest :meth:`evaluate`.
+        Eq. 5: write the gradients of each critic's loss Σ weights · (y − Q)², at inputs that are remembered as by
+        :meth:`evaluate`.
 
-        :param gradients: of the loss, at its Q-values (critics, agents, batch)
+        :param inputs: as for :meth:`forward`
+        :param targets: y (agents, batch)
+        :param weights: of each row in its agent's loss (agents, batch)
+        :return: the errors y − Q (critics, agents, batch), and the losses (critics, agents)
         """
-        for i, stack in enumerate(self.stacks):
-            critic, run = divmod(i, len(self.positions))
-            stack.backward(self._of_run(gradients[critic], run).unsqueeze(-1))  # type: ignore[operator]
+        self._inputs[:] = [inputs]
+        runs = [(self._of_run(targets, run)[..., None], self._of_run(weights, run)[..., None]) for run in range(self.n_runs)]
+        found = [
+            stack.regress(read, *runs[i % self.n_runs])  # type: ignore[operator]
+            for i, (stack, read) in enumerate(zip(self.stacks, self._reads(inputs), strict=True))
+        ]
+        errors, losses = zip(*found, strict=True)
+        return self._by_critic(errors), self._by_critic(losses)
+
+    def ascend(self, own_actions: Sequence[th.Tensor], weights: th.Tensor) -> tuple[th.Tensor, list[th.Tensor]]:
+        """
+        Eq. 6: the losses −Σ weights · Q of each agent's first critic at the latest inputs, with the agent's own action
+        replaced and all others as they are, and their gradients at these actions, through critics that stay as they are.
+
+        :param own_actions: per block (agents, batch, action)
+        :param weights: of each row in its agent's loss (agents, batch)
+        :return: the losses (agents,), and the gradients per block (agents, batch, action)
+        """
+        evaluation = self.stacks[0].evaluation(weights.shape[1])  # type: ignore[operator]
+        if isinstance(evaluation, CompiledEvaluation) and self.common_input and evaluation.whole:
+            return evaluation.ascend(self._inputs[0], self._own_columns, own_actions, weights)
+        losses = -(self.evaluate_own_actions(own_actions) * weights).sum(-1)
+        return losses, self.own_action_gradients(-weights)
 
     def evaluate_own_actions(self, own_actions: Sequence[th.Tensor]) -> th.Tensor:
         """
@@ -167,17 +196,17 @@ class CentralCritics(nn.Module):
 
     def _reads(self, inputs: th.Tensor) -> list[th.Tensor]:
         """What each stack reads."""
-        return self._read(inputs) * (len(self.stacks) // len(self.positions))
+        return self._read(inputs) * (len(self.stacks) // self.n_runs)
 
-    def _by_critic(self, values: list[th.Tensor]) -> th.Tensor:
-        """Values of each stack (members, batch, 1) → (critics, agents, batch)."""
-        n_runs = len(self.positions)
+    def _by_critic(self, values: Sequence[th.Tensor]) -> th.Tensor:
+        """Values of each stack (members, …, 1) → (critics, agents, …)."""
+        n_runs = self.n_runs
         critics = [by_agent(self.positions, values[i : i + n_runs]) for i in range(0, len(values), n_runs)]
         return (th.stack(critics) if len(critics) > 1 else critics[0].unsqueeze(0)).squeeze(-1)
 
     def _of_run(self, values: th.Tensor, run: int) -> th.Tensor:
         """(agents, …) → those of a run."""
-        return values if len(self.positions) == 1 else values[self.positions[run]]
+        return values if self.n_runs == 1 else values[self.positions[run]]
 
     def network(self, position: int, critic: int = 0) -> nn.Sequential:
         """One critic as separate layers (a copy); ``position`` counts the learning agents."""
