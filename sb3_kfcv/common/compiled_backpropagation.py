@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import is_
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch as th
 from torch import nn
 
 from sb3_kfcv.common.backpropagation import Evaluation, gradient_of
-from sb3_kfcv.common.compiled_layers import FLOAT, FUSED, LAYER, OWN_INPUTS, ascend, backward, forward, regress
+from sb3_kfcv.common.compiled_layers import FUSED, LAYER, OWN_INPUTS, ascend, backward, forward, regress
 
 if TYPE_CHECKING:
     from sb3_kfcv.common.stacked_networks import StackedMLP
@@ -45,37 +46,41 @@ class CompiledEvaluation(Evaluation):
             layer["weight"], layer["bias"] = weight.data_ptr(), bias.data_ptr()
             layer["n_in"], layer["n_out"] = stack.sizes[i : i + 2]
             self._lie(layer, "z", self.layers[i])
-        for before, after, z, gradient in zip(self.plan[:-1], self.plan[1:], self.layers[:-1], self.gradients, strict=True):
-            self._lie(before, "z_gradient", gradient)  # that of the last layer is given each time
-            self._lie(after, "x", z)
-            after["x_gradient"] = gradient.data_ptr()
         self.value_gradient = self.layers[-1].new_empty(self.layers[-1].shape)
+        for layer, gradient in zip(self.plan, [*self.gradients, self.value_gradient], strict=True):
+            self._lie(layer, "z_gradient", gradient)
+        for layer, z, gradient in zip(self.plan[1:], self.layers, self.gradients, strict=False):
+            self._lie(layer, "x", z)
+            layer["x_gradient"] = gradient.data_ptr()
         self.after_first = self.plan[1:]
-        self.passed = self.plan.copy()  # the same, where no gradients of parameters are wanted
-        self.learnt, learnt = self.after_first, [*zip(self.after_first, self.parameters, strict=True)]  # where they are
+        self.passed = self.after_first.copy()  # the same, where no gradients of parameters are wanted
+        self.learnt, learnt = self.after_first, self.parameters  # layers and parameters where they are
+        if self.whole:
+            self.learnt, learnt = self.plan, [(stack.first.weight, stack.first.bias), *self.parameters]  # type: ignore[list-item]
+            self._describe_first(self.plan[0])
+        names = ("weight_gradient", "bias_gradient")
         self.learnt_parameters = [
             (layer, name, parameter)
-            for layer, own in learnt
-            for name, parameter in zip(("weight_gradient", "bias_gradient"), own, strict=True)
+            for layer, own in zip(self.learnt, learnt, strict=True)
+            for name, parameter in zip(names, own, strict=True)
         ]
-        if self.whole:
-            self._include_first()
+        if self.whole and stack.member_bias is not None:
+            self.learnt_parameters.append((self.plan[0], "member_bias_gradient", stack.member_bias))
+        self.placed: list[th.Tensor | None] = []  # gradients whose places are in the plan
+        self.pointers: list[int] = []
         room = [layer["n_in"] * layer["n_out"] for layer in self.learnt]
         self.scratch = np.ones(max(*room, *self.plan["n_out"]) + 1, np.float32)
 
-    def _include_first(self) -> None:
-        """Let the first layer be one of those that are compiled."""
-        stack, first = self.stack, self.plan[0]
-        self.learnt = self.plan
-        own = {"weight_gradient": stack.first.weight, "bias_gradient": stack.first.bias}
+    def _describe_first(self, first: np.void) -> None:
+        """What a first layer has that others have not."""
+        stack, numbers = self.stack, self.plan.view(np.int64)
+        self.at_x = numbers[: LAYER.names.index("x_row") + 1]  # type: ignore[union-attr]  # its first fields
         if stack.common_input:
             columns = th.arange(stack.sizes[0]).expand(stack.n_members, -1)
             self.rows = stack.first_layer_rows(range(stack.n_members), columns).contiguous()
             first["weight_rows"] = self.rows.data_ptr()
         if stack.member_bias is not None:
-            first["member_bias"], own["member_bias_gradient"] = stack.member_bias.data_ptr(), stack.member_bias
-        self.passed[0] = first
-        self.learnt_parameters += [(first, name, parameter) for name, parameter in own.items()]
+            first["member_bias"] = stack.member_bias.data_ptr()
 
     @staticmethod
     def serves(stack: StackedMLP) -> bool:
@@ -96,28 +101,17 @@ class CompiledEvaluation(Evaluation):
         """Note where a tensor (members, rows, features) lies."""
         layer[name], layer[f"{name}_member"], layer[f"{name}_row"] = tensor.data_ptr(), tensor.stride(0), tensor.stride(1)
 
-    def _readable(self, values: th.Tensor, members: int, size: int) -> th.Tensor:
-        """
-        Values in rows that lie in one piece: what is not where it is taken to be would be read all the same.
-
-        :raises ValueError: if they are not (members, rows, size) in the processor's memory
-        """
-        if values.shape != (members, self.batch, size) or not values.is_cpu:
-            expected, got = f"{(members, self.batch, size)} on cpu", f"{tuple(values.shape)} on {values.device}"
-            raise ValueError(f"expected (networks, rows, features) = {expected}, got {got}")
-        return values if values.dtype == th.float32 and values.stride(2) == 1 else values.float().contiguous()
-
     def values(self, x: th.Tensor) -> th.Tensor:
         if not self.whole:
             return super().values(x)
-        self._given(x, self.plan[0])
+        self._given(x)
         self._forward(self.plan, False)
         return self.layers[-1]
 
     def first_layer(self, x: th.Tensor) -> th.Tensor:
         if not self.whole:
             return super().first_layer(x)
-        self._given(x, self.plan[0])
+        self._given(x)
         self._forward(self.plan[:1], False)
         return self.layers[0]
 
@@ -128,8 +122,7 @@ class CompiledEvaluation(Evaluation):
     def regress(self, x: th.Tensor, targets: th.Tensor, weights: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         if not self.whole:
             return super().regress(x, targets, weights)
-        self._given(x, self.plan[0])
-        self._lie(self.plan[-1], "z_gradient", self.value_gradient)
+        self._given(x)
         apart = self._place_gradients()
         errors = th.empty_like(self.value_gradient)
         losses = errors.new_empty(errors.shape[0], errors.shape[2])
@@ -140,69 +133,64 @@ class CompiledEvaluation(Evaluation):
         return errors, losses
 
     def ascend(
-        self,
-        x: th.Tensor,
-        places: Sequence[tuple[Sequence[int], Sequence[int]]],
-        own_inputs: Sequence[th.Tensor],
-        weights: th.Tensor,
+        self, x: th.Tensor, own: OwnInputs, values: Sequence[th.Tensor], weights: th.Tensor
     ) -> tuple[th.Tensor, list[th.Tensor]]:
         """
         Of a common input whose first layer is compiled, and networks of one value: the losses −Σ weights · values, summed over
         the rows, where some inputs are the member's own, and their gradients at these.
 
-        :param x: (batch, in)
-        :param places: by block of members, each once: which, and in which column of the input the own ones of each begin
-        :param own_inputs: by block (members, batch, own)
+        :param x: (1, batch, in)
+        :param own: which inputs
+        :param values: what stands there, by block (members, batch, own)
         :param weights: of each value (members, batch)
         :return: the losses (members,), and the gradients by block (members, batch, own)
         """
-        self._given(x.unsqueeze(0), self.passed[0])
-        self._lie(self.passed[-1], "z_gradient", self.value_gradient)
-        own_inputs = [
-            self._readable(own, len(members), own.shape[2]).contiguous()
-            for (members, _), own in zip(places, own_inputs, strict=True)
-        ]
-        gradients = [th.empty_like(own) for own in own_inputs]
-        places_of = np.zeros(self.shape[0], OWN_INPUTS)
-        for (members, columns), own, gradient in zip(places, own_inputs, gradients, strict=True):
-            size = own.shape[2]
-            for i, (member, column) in enumerate(zip(members, columns, strict=True)):
-                start = FLOAT * i * self.batch * size
-                places_of[member] = (own.data_ptr() + start, gradient.data_ptr() + start, column, size)
+        self._given(x)
+        shapes = [(n_members, self.batch, size) for n_members, size in own.blocks]
+        read = [self._numbers(new, shape) for new, shape in zip(values, shapes, strict=True)]
+        gradients = [x.new_empty(shape) for shape in shapes]
+        addresses = np.array([[new.ctypes.data for new in read], [gradient.data_ptr() for gradient in gradients]])
         losses = x.new_empty(self.shape[0])
-        room = np.empty((2 * self.width + self.batch) * int(places_of["size"].max()), np.float32)
-        climb = (places_of, self._numbers(weights, self.shape), losses.numpy(), room)
-        ascend(self.passed, self.numbers, self.stack.n_networks, self.batch, climb, self.scratch)
+        room = np.empty((2 * self.width + self.batch) * own.widest, np.float32)
+        climb = (own.places, addresses, self._numbers(weights, self.shape), losses.numpy(), room)
+        ascend(self.plan[:1], self.passed, self.numbers, self.stack.n_networks, self.batch, climb, self.scratch)
         return losses, gradients
 
-    def _numbers(self, values: th.Tensor, shape: Sequence[int]) -> np.ndarray:
+    def _given(self, x: th.Tensor) -> None:
+        """
+        Note where the input lies: what is not where it is taken to be would be read all the same.
+
+        :raises ValueError: if it is not (members, rows, features) in the processor's memory
+        """
+        common = self.stack.common_input
+        self._require_shape(x, (1 if common else self.shape[0], self.batch, self.stack.sizes[0]))
+        self.x = x if x.dtype == th.float32 and x.stride(2) == 1 else x.float().contiguous()
+        self.at_x[:] = self.x.data_ptr(), 0 if common else self.x.stride(0), self.x.stride(1)
+
+    def _numbers(self, values: th.Tensor, shape: tuple[int, ...]) -> np.ndarray:
         """
         Values as an array in one piece.
 
         :raises ValueError: if they are not of the shape, in the processor's memory
         """
-        if values.shape != shape or not values.is_cpu:
-            raise ValueError(f"expected {tuple(shape)} on cpu, got {tuple(values.shape)} on {values.device}")
+        self._require_shape(values, shape)
         return values.detach().float().contiguous().numpy()
 
-    def _given(self, x: th.Tensor, first: np.void) -> None:
-        """Note for the first layer where the input lies."""
-        common = self.stack.common_input
-        self.x = self._readable(x, 1 if common else self.shape[0], self.stack.sizes[0])
-        self._lie(first, "x", self.x)
-        if common:
-            first["x_member"] = 0
+    @staticmethod
+    def _require_shape(values: th.Tensor, shape: tuple[int, ...]) -> None:
+        if values.shape != shape or not values.is_cpu:
+            raise ValueError(f"expected {tuple(shape)} on cpu, got {tuple(values.shape)} on {values.device}")
 
     def _forward(self, layers: np.ndarray, rectify_first: bool) -> None:
         forward(layers, self.numbers, self.batch, rectify_first, self.scratch)
 
     def _through_layers(self, gradient: th.Tensor, parameters: bool) -> None:
         """With the first one where it is compiled and parameters' gradients are wanted."""
-        gradient = self._readable(gradient, self.shape[0], self.stack.sizes[-1])
-        layers = self.learnt if parameters else self.passed[1:]
-        self._lie(layers[-1], "z_gradient", gradient)
+        self._require_shape(gradient, (self.shape[0], self.batch, self.stack.sizes[-1]))
+        self.value_gradient.copy_(gradient)
+        layers = self.learnt if parameters else self.passed
         if layers is self.plan:
-            self._given(self.x, self.plan[0])  # it may have been given another place since
+            self._given(self.x)  # it may have been given another place since
         apart = self._place_gradients() if parameters else []
         backward(layers, self.numbers, self.stack.n_networks, self.batch, self.scratch)
         for into, written in apart:
@@ -214,14 +202,32 @@ class CompiledEvaluation(Evaluation):
 
     def _place_gradients(self) -> list[tuple[th.Tensor, th.Tensor]]:
         """Note where the parameters' gradients are to be written; those that cannot be, with what is to be copied there."""
+        gradients = [gradient_of(parameter) for _, _, parameter in self.learnt_parameters]
+        pointers = [0 if gradient is None else gradient.data_ptr() for gradient in gradients]
+        if pointers == self.pointers and all(map(is_, gradients, self.placed)):
+            return []
         apart = []
-        for layer, name, parameter in self.learnt_parameters:
-            if (into := gradient_of(parameter)) is None:
-                layer[name] = 0
-                continue
-            written = into
-            if into.dtype != th.float32 or not (into.is_cpu and into.is_contiguous()):  # set by somebody else
-                written = th.empty(parameter.shape)
-                apart.append((into, written))
-            layer[name] = written.data_ptr()
+        for i, (into, (layer, name, parameter)) in enumerate(zip(gradients, self.learnt_parameters, strict=True)):
+            if into is not None and (into.dtype != th.float32 or not (into.is_cpu and into.is_contiguous())):
+                apart.append((into, th.empty(parameter.shape)))  # set by somebody else
+                pointers[i] = apart[-1][1].data_ptr()
+            layer[name] = pointers[i]
+        self.placed, self.pointers = ([], []) if apart else (gradients, pointers)
         return apart
+
+
+class OwnInputs:
+    """
+    Inputs that are each member's own, in place of some of a common input.
+
+    :param blocks: of members with as many own inputs each: which, and in which column of the input the own ones of each begin
+    :param sizes: of each block, how many own inputs
+    """
+
+    def __init__(self, blocks: Sequence[tuple[Sequence[int], Sequence[int]]], sizes: Sequence[int]) -> None:
+        self.blocks = [(len(members), size) for (members, _), size in zip(blocks, sizes, strict=True)]
+        self.widest = max(sizes)
+        self.places = np.zeros(sum(len(members) for members, _ in blocks), OWN_INPUTS)
+        for number, ((members, columns), size) in enumerate(zip(blocks, sizes, strict=True)):
+            for i, (member, column) in enumerate(zip(members, columns, strict=True)):
+                self.places[member] = (number, i, column, size)

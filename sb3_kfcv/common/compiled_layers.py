@@ -38,10 +38,10 @@ LAYER = np.dtype(
 )
 """A layer of a stack. The gradient of what it reads lies as that itself does."""
 
-OWN_INPUTS = np.dtype([(name, np.int64) for name in ("values", "gradient", "column", "size")])
+OWN_INPUTS = np.dtype([(name, np.int64) for name in ("block", "number", "column", "size")])
 """
-Of a member: the addresses of its own inputs (rows, size), which stand in place of those in the common input from a column on,
-and of their gradient.
+Of a member: where its own inputs are, a block (members of the block, rows, size) and its number there; from which column on
+they stand in place of those in the common input, and how many.
 """
 
 _FEATURES = llvm.get_host_cpu_features()
@@ -379,34 +379,35 @@ def regress(layers, members, n_networks, n_rows, fit, scratch):
 
 
 @njit(cache=True)
-def ascend(layers, members, n_networks, n_rows, climb, scratch):
+def ascend(firsts, rest, members, n_networks, n_rows, climb, scratch):
     """
     Evaluate with own inputs, and go back to them from the losses −Σ weights · values, summed over the rows, of one value each.
 
     The first layer is computed as for the common input; own inputs move it by (new − old) · (their weights).
 
-    :param layers: array of ``LAYER``, all of a stack, the first with ``weight_rows``; the last one's ``z_gradient`` is written
+    :param firsts: array of ``LAYER``: the first one of a stack, with ``weight_rows``
+    :param rest: array of ``LAYER``: the others, without gradients of parameters; the last one's ``z_gradient`` is written
     :param members: network of each member
     :param n_networks: number of networks
     :param n_rows: rows of each member
-    :param climb: array of ``OWN_INPUTS`` (members,); weight of each value (members, rows); where the losses are written
-        (members,); room for the widest own inputs times (2 hidden + rows)
+    :param climb: array of ``OWN_INPUTS`` (members,); addresses of the blocks of own inputs and of those of their gradients
+        (2, blocks); weight of each value (members, rows); where the losses are written (members,); room for the most own
+        inputs of a member times (2 hidden + rows)
     :param scratch: as for :func:`forward` and :func:`backward`
     """
-    own_inputs, weights, losses, room = climb
-    first, rest = layers[0], layers[1:]
+    own_inputs, blocks, weights, losses, room = climb
+    first, last = firsts[0], rest[len(rest) - 1]
     hidden = first.n_out
-    widest = room.size // (2 * hidden + n_rows)
     own_weights = room.ctypes.data
-    transposed = own_weights + FLOAT * hidden * widest
-    moved = transposed + FLOAT * hidden * widest
+    transposed = own_weights + FLOAT * hidden * (room.size // (2 * hidden + n_rows))
+    moved = transposed + transposed - own_weights
 
-    forward(layers[:1], members, n_rows, False, scratch)
+    forward(firsts, members, n_rows, False, scratch)
     for member in range(len(members)):
         own = own_inputs[member]
         rows = first.weight_rows + INTEGER * (member * first.n_in + own.column)
         _gather_rows(first.weight, rows, own.size, hidden, own_weights)
-        new, difference = _numbers_at(own.values), _numbers_at(moved)
+        new, difference = _numbers_at(blocks[0, own.block] + FLOAT * own.number * n_rows * own.size), _numbers_at(moved)
         for i in range(n_rows):
             old = _numbers_at(first.x + FLOAT * (member * first.x_member + i * first.x_row + own.column))
             for j in range(own.size):
@@ -415,7 +416,6 @@ def ascend(layers, members, n_networks, n_rows, climb, scratch):
         add_product(moved, own.size, 1, own_weights, hidden, z, first.z_row, n_rows, own.size, hidden)
     forward(rest, members, n_rows, True, scratch)
 
-    last = layers[len(layers) - 1]
     for member in range(len(members)):
         loss = 0.0
         for i in range(n_rows):
@@ -431,6 +431,7 @@ def ascend(layers, members, n_networks, n_rows, climb, scratch):
         rows = first.weight_rows + INTEGER * (member * first.n_in + own.column)
         _gather_rows(first.weight, rows, own.size, hidden, own_weights)
         _transpose(own_weights, own.size, hidden, transposed)
-        _fill(own.gradient, own.size, n_rows, own.size, 0)
+        into = blocks[1, own.block] + FLOAT * own.number * n_rows * own.size
+        _fill(into, own.size, n_rows, own.size, 0)
         at_first, row = first.z_gradient + FLOAT * member * first.z_gradient_member, first.z_gradient_row
-        add_product(at_first, row, 1, transposed, own.size, own.gradient, own.size, n_rows, hidden, own.size)
+        add_product(at_first, row, 1, transposed, own.size, into, own.size, n_rows, hidden, own.size)

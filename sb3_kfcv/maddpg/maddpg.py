@@ -26,6 +26,7 @@ from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.noise import OneDraw
 from sb3_kfcv.common.schedules import schedule_of
 from sb3_kfcv.maddpg.diagnostics import Diagnostics
+from sb3_kfcv.maddpg.joint_rows import critic_inputs, td_targets
 from sb3_kfcv.maddpg.policies import (
     CRITIC_INPUTS,
     CentralCritics,
@@ -185,6 +186,7 @@ class MADDPG(JointAlgorithm):
         self._learning = slice(self.agents[0], self.agents[-1] + 1) if adjoin else self.agents  # a slice makes no copy
         agent_of_column = [i for i, size in enumerate(layout.action_sizes) for _ in range(size)]
         self._agent_of_column = th.tensor(agent_of_column, device=self.device)
+        self._learning_agents = th.tensor(self.agents, device=self.device)
         self._opponent_policy = self._make_opponent_policy()
         self._line_up: LineUp | None = None  # who of the opponents plays in each world
         if self.plays_only:
@@ -356,10 +358,9 @@ class MADDPG(JointAlgorithm):
         continues = 1 - batch.dones  # (batch, agents): also of one that has joined in this step
         next_actions = self._target_actions(batch.next_observations)
         next_inputs = self._critic_inputs(batch.next_observations, batch.next_states, next_actions, continues)
-        next_q_values = self.critic_target.evaluate(next_inputs).amin(0)
+        next_q_values = self.critic_target.evaluate(next_inputs)  # (critics, agents, batch)
         rewards = batch.rewards if self.reward_scale == 1 else self.reward_scale * batch.rewards
-        rewards, continues = rewards.T[self._learning], continues.T[self._learning]
-        return th.addcmul(rewards, continues, next_q_values, value=self.gamma)
+        return td_targets(rewards, continues, next_q_values, self._learning_agents, self.gamma)
 
     def teacher_inputs(self, batch: JointReplayBufferSamples) -> th.Tensor:
         """
@@ -369,7 +370,7 @@ class MADDPG(JointAlgorithm):
         :return: (batch, features)
         """
         seen = batch.states if self._teachers_see_state else batch.observations
-        return th.cat([seen, self.policy.encode(batch.actions) * batch.alive.index_select(1, self._agent_of_column)], dim=1)
+        return critic_inputs(seen, self.policy.encode(batch.actions), batch.alive, self._agent_of_column)
 
     @th.no_grad()
     def q_values(self, batch: JointReplayBufferSamples) -> th.Tensor:
@@ -387,7 +388,7 @@ class MADDPG(JointAlgorithm):
 
     def _critic_inputs(self, observations: th.Tensor, states: th.Tensor, actions: th.Tensor, alive: th.Tensor) -> th.Tensor:
         seen = states if self.critic_input == "state" else observations
-        return th.cat([seen, actions * alive.index_select(1, self._agent_of_column)], dim=1)
+        return critic_inputs(seen, actions, alive, self._agent_of_column)
 
     def _target_actions(self, observations: th.Tensor) -> th.Tensor:
         """(batch, joint action): a' of all agents, the learning ones by their target actors, the others as they play."""
@@ -546,6 +547,7 @@ class MADDPG(JointAlgorithm):
             "n_learning_agents",
             "_learning",
             "_agent_of_column",
+            "_learning_agents",
             "_parameters",
             "_target_parameters",
             "teacher_input_size",

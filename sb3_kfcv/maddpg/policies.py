@@ -17,7 +17,7 @@ from sb3_kfcv.common.actors import ActorPolicy, Block, StackedActors, by_agent, 
 from sb3_kfcv.common.adam import LeanAdam
 from sb3_kfcv.common.backpropagation import Evaluation
 from sb3_kfcv.common.checks import require_count
-from sb3_kfcv.common.compiled_backpropagation import CompiledEvaluation
+from sb3_kfcv.common.compiled_backpropagation import CompiledEvaluation, OwnInputs
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.stacked_networks import StackedMLP, at_most
 from sb3_kfcv.saving.archive import open_archive, write_archive
@@ -77,9 +77,9 @@ class CentralCritics(nn.Module):
             run = next(r for r, positions in enumerate(self.positions) if block.positions[0] in positions)
             self._places.append((run, None if block.positions == self.positions[run] else block.positions))
             self.register_buffer(f"_own_rows_{i}", self._own_rows(i, block), persistent=False)
-        # Of each block: the agents' places, and where in the joint input their own actions begin
-        starts = [self.actions_start + block.action_columns.index[:, 0] for block in self.blocks]
-        self._own_columns = [(block.positions, own.tolist()) for block, own in zip(self.blocks, starts, strict=True)]
+        starts = [(self.actions_start + block.action_columns.index[:, 0]).tolist() for block in self.blocks]
+        own_actions = [(block.positions, own) for block, own in zip(self.blocks, starts, strict=True)]
+        self._own_inputs = OwnInputs(own_actions, [block.action_size for block in self.blocks])
         self._inputs: list[th.Tensor] = []  # of the latest evaluation
         # Of the latest evaluation of own actions: the stacks' evaluations, and per block the weights of the own action
         self._moved: list[Evaluation] = []
@@ -125,11 +125,10 @@ class CentralCritics(nn.Module):
         :return: the errors y − Q (critics, agents, batch), and the losses (critics, agents)
         """
         self._inputs[:] = [inputs]
-        runs = [(self._of_run(targets, run)[..., None], self._of_run(weights, run)[..., None]) for run in range(self.n_runs)]
-        found = [
-            stack.regress(read, *runs[i % self.n_runs])  # type: ignore[operator]
-            for i, (stack, read) in enumerate(zip(self.stacks, self._reads(inputs), strict=True))
-        ]
+        found = []
+        for i, (stack, read) in enumerate(zip(self.stacks, self._reads(inputs), strict=True)):
+            own_targets, own_weights = (self._of_run(values, i % self.n_runs).unsqueeze(-1) for values in (targets, weights))
+            found.append(stack.regress(read, own_targets, own_weights))  # type: ignore[operator]
         errors, losses = zip(*found, strict=True)
         return self._by_critic(errors), self._by_critic(losses)
 
@@ -144,7 +143,7 @@ class CentralCritics(nn.Module):
         """
         evaluation = self.stacks[0].evaluation(weights.shape[1])  # type: ignore[operator]
         if isinstance(evaluation, CompiledEvaluation) and self.common_input and evaluation.whole:
-            return evaluation.ascend(self._inputs[0], self._own_columns, own_actions, weights)
+            return evaluation.ascend(self._inputs[0].unsqueeze(0), self._own_inputs, own_actions, weights)
         losses = -(self.evaluate_own_actions(own_actions) * weights).sum(-1)
         return losses, self.own_action_gradients(-weights)
 
@@ -201,8 +200,8 @@ class CentralCritics(nn.Module):
     def _by_critic(self, values: Sequence[th.Tensor]) -> th.Tensor:
         """Values of each stack (members, …, 1) → (critics, agents, …)."""
         n_runs = self.n_runs
-        critics = [by_agent(self.positions, values[i : i + n_runs]) for i in range(0, len(values), n_runs)]
-        return (th.stack(critics) if len(critics) > 1 else critics[0].unsqueeze(0)).squeeze(-1)
+        critics = [by_agent(self.positions, values[i : i + n_runs]).squeeze(-1) for i in range(0, len(values), n_runs)]
+        return th.stack(critics) if len(critics) > 1 else critics[0].unsqueeze(0)
 
     def _of_run(self, values: th.Tensor, run: int) -> th.Tensor:
         """(agents, …) → those of a run."""
