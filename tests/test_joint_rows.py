@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from sb3_kfcv.maddpg.joint_rows import critic_inputs, td_targets
+from sb3_kfcv.maddpg.joint_rows import critic_inputs, loss_shares, td_targets
 
 AGENT_OF_COLUMN = th.tensor([0, 0, 1, 2, 2, 2])
 
@@ -26,6 +26,13 @@ def test_rows_may_lie_apart():
     seen, actions, present = th.randn(4, 7).T, th.randn(6, 7).T, th.ones(3, 7).T
     inputs = critic_inputs(seen, actions, present, AGENT_OF_COLUMN)
     assert th.equal(inputs, th.cat([seen, actions], dim=1))
+
+
+def test_rows_of_the_living_share_their_agent_s_loss():
+    alive = th.tensor([[1.0, 0.0, 1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    expected = [[0.5, 0, 0.5, 0], [0.25] * 4, [0] * 4]
+    for rows in (alive, alive.double()):
+        assert loss_shares(rows, th.tensor([2, 0, 1])).tolist() == expected
 
 
 def test_td_targets_by_hand():

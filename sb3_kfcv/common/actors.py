@@ -75,7 +75,7 @@ class _Columns:
 
     def read(self, rows: th.Tensor) -> th.Tensor:
         """(batch, joint) → (agents, batch, size)."""
-        return rows[:, self.range].view(len(rows), self.count, self.size).transpose(0, 1)
+        return rows[:, self.range].view(rows.shape[0], self.count, self.size).transpose(0, 1)
 
     def write(self, rows: th.Tensor, values: th.Tensor) -> None:
         """Put (agents, batch, size) into (batch, joint)."""
@@ -164,7 +164,7 @@ class StackedActors(nn.Module):
                 (at_output,) = th.autograd.grad(actions, output, gradient)
                 output = output.detach()
             else:
-                at_output = th.ops.aten.tanh_backward(gradient, actions)
+                at_output = _tanh_backward(gradient, actions)
             if penalties is not None:
                 at_output = at_output.addcmul_(output, penalties[block.positions].unsqueeze(-1), value=2 / output.shape[-1])
             stack.backward(at_output)  # type: ignore[operator]
@@ -186,6 +186,9 @@ class StackedActors(nn.Module):
             if agent in block.agents:
                 return stack.network(block.agents.index(agent))  # type: ignore[operator]
         raise ValueError(f"{self.layout.agents[agent]!r} is not among the learning agents")
+
+
+_tanh_backward = th.ops.aten.tanh_backward.default
 
 
 def shared_members(layout: AgentLayout, agents: Sequence[int]) -> list[int]:

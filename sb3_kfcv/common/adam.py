@@ -18,7 +18,7 @@ class _Found(NamedTuple):
     exp_avgs: list[th.Tensor]
     exp_avg_sqs: list[th.Tensor]
     steps: list[th.Tensor]
-    all_steps: th.Tensor  # these are views of it
+    all_steps: Any  # these are views of it; on the CPU as an array, which is quicker to count up
 
 
 class LeanAdam(th.optim.Adam):
@@ -50,7 +50,7 @@ class LeanAdam(th.optim.Adam):
             self._found = self._find(group)
             return None
         beta1, beta2 = group["betas"]
-        self._found.all_steps.add_(1)
+        self._found.all_steps.__iadd__(1)
         th._fused_adam_(
             self._found.parameters,
             gradients,  # type: ignore[arg-type]
@@ -86,7 +86,7 @@ class LeanAdam(th.optim.Adam):
         for state, steps in zip(states, all_steps, strict=True):
             state["step"] = steps
         exp_avgs, exp_avg_sqs, steps = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
-        return _Found(group["params"], exp_avgs, exp_avg_sqs, steps, all_steps)
+        return _Found(group["params"], exp_avgs, exp_avg_sqs, steps, all_steps.numpy() if all_steps.is_cpu else all_steps)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """As in PyTorch."""

@@ -101,7 +101,9 @@ class Diagnostics:
 
 def _stacked(noted: deque[th.Tensor]) -> th.Tensor:
     """What was noted of each update, of several critics the mean: (updates, agents)."""
-    return th.stack([values if values.ndim == 1 else values.mean(0) for values in noted])
+    means = [values for values in noted if values.ndim == 1]  # those of a file come first
+    of_critics = [values for values in noted if values.ndim == 2]
+    return th.cat([*([th.stack(means)] if means else ()), *([th.stack(of_critics).mean(1)] if of_critics else ())])
 
 
 def _mean_norm(networks: StackedActors | CentralCritics) -> float:

@@ -11,6 +11,8 @@ import numpy as np
 import torch as th
 from numba import njit
 
+from sb3_kfcv.common.live import shares
+
 
 def critic_inputs(seen: th.Tensor, actions: th.Tensor, present: th.Tensor, agent_of_column: th.Tensor) -> th.Tensor:
     """
@@ -27,6 +29,21 @@ def critic_inputs(seen: th.Tensor, actions: th.Tensor, present: th.Tensor, agent
     inputs = seen.new_empty(len(seen), seen.shape[1] + actions.shape[1])
     _fill_inputs(_arrays(seen, actions, present, agent_of_column), inputs.numpy())
     return inputs
+
+
+def loss_shares(alive: th.Tensor, agents: th.Tensor) -> th.Tensor:
+    """
+    The share of each row in its agent's loss: equal ones of those in which it lives, see :func:`shares`.
+
+    :param alive: 1 where the agent lives, or 0 (batch, all agents)
+    :param agents: which agents (agents,)
+    :return: (agents, batch)
+    """
+    if not _compiled(alive):
+        return shares(alive.T[agents])
+    found = alive.new_empty(len(agents), len(alive))
+    _fill_shares(_arrays(alive, agents), found.numpy())
+    return found
 
 
 def td_targets(
@@ -67,6 +84,17 @@ def _fill_inputs(given, inputs):
             inputs[row, column] = seen[row, column]
         for column, agent in enumerate(agent_of_column):
             inputs[row, n_seen + column] = actions[row, column] * present[row, agent]
+
+
+@njit(cache=True)
+def _fill_shares(given, found):
+    alive, agents = given
+    for position, agent in enumerate(agents):
+        living = np.float32(0)
+        for row in range(alive.shape[0]):
+            living += alive[row, agent]
+        for row in range(alive.shape[0]):
+            found[position, row] = alive[row, agent] / max(living, np.float32(1))
 
 
 @njit(cache=True)

@@ -26,7 +26,7 @@ from sb3_kfcv.common.naming import unknown_name
 from sb3_kfcv.common.noise import OneDraw
 from sb3_kfcv.common.schedules import schedule_of
 from sb3_kfcv.maddpg.diagnostics import Diagnostics
-from sb3_kfcv.maddpg.joint_rows import critic_inputs, td_targets
+from sb3_kfcv.maddpg.joint_rows import critic_inputs, loss_shares, td_targets
 from sb3_kfcv.maddpg.policies import (
     CRITIC_INPUTS,
     CentralCritics,
@@ -318,8 +318,7 @@ class MADDPG(JointAlgorithm):
             # Algorithm 1: "Sampling a minibatch of experience quadruples from D". The buffer decides what is drawn: all alike,
             # by priority, or by the curriculum, whose folds, teachers, scores and stages it refreshes when due.
             batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
-            live = self.live(batch)  # (agents, batch): a dead agent's rows enter no loss
-            share = shares(live)  # (agents, batch): of each row in its agent's loss
+            share = loss_shares(batch.alive, self._learning_agents)  # (agents, batch): a dead agent's rows enter no loss
 
             # Eq. 5: minimise (y − Q)², y = r + γ Q'(s', a'_1 … a'_N)
             inputs = self._critic_inputs(batch.observations, batch.states, self.policy.encode(batch.actions), batch.alive)
@@ -342,7 +341,7 @@ class MADDPG(JointAlgorithm):
                 th._foreach_lerp_(self._target_parameters, self._parameters, self.tau)
 
             if self.replay_buffer.uses_td_errors:
-                self.replay_buffer.update_priorities(batch.rows, (errors[0].abs() * shares(live, dim=0)).sum(0))
+                self.replay_buffer.update_priorities(batch.rows, (errors[0].abs() * shares(self.live(batch), dim=0)).sum(0))
             self._watch.critics(critic_losses, targets)
 
         self._watch.update_seconds += time.perf_counter() - start
@@ -355,7 +354,7 @@ class MADDPG(JointAlgorithm):
 
         :return: (agents, batch), the learning agents
         """
-        continues = 1 - batch.dones  # (batch, agents): also of one that has joined in this step
+        continues = th.rsub(batch.dones, 1)  # 1 − done (batch, agents): also of one that has joined in this step
         next_actions = self._target_actions(batch.next_observations)
         next_inputs = self._critic_inputs(batch.next_observations, batch.next_states, next_actions, continues)
         next_q_values = self.critic_target.evaluate(next_inputs)  # (critics, agents, batch)
