@@ -10,7 +10,7 @@ from numba import njit, types
 from numba.core import event
 from numba.experimental import structref
 
-NOTICE = "compiling kernels (once per machine, about 20 s)…"
+NOTICE = "compiling kernels (once per machine, about 30 s)…"
 
 
 def drop_stale_cache(source: Path) -> None:
