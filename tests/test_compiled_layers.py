@@ -104,8 +104,10 @@ def test_least_squares_are_those_of_autograd(kind, sizes, batch):
 @pytest.mark.parametrize("changed", ["targets", "weights"])
 def test_targets_and_weights_of_another_shape_are_refused(changed):
     given = {"targets": th.zeros(3, 5, 2), "weights": th.ones(3, 5, 2), changed: th.zeros(3, 4, 2)}
+    stack = StackedMLP(3, [4, 6, 2])
     with pytest.raises(ValueError, match=r"expected \(3, 5, 2\) on cpu, got \(3, 4, 2\) on cpu"):
-        StackedMLP(3, [4, 6, 2]).regress(th.zeros(3, 5, 4), **given)
+        stack.regress(th.zeros(3, 5, 4), **given)
+    assert all(parameter.grad is None for parameter in stack.parameters())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -153,6 +155,17 @@ def test_gradients_that_others_have_set_are_written_into():
     stack.evaluate(x)
     stack.backward(gradient)
     close(theirs.transpose(1, 2), expected.double())
+
+
+def test_gradients_that_others_have_turned_are_written_into():
+    stack = StackedMLP(3, [4, 6, 6, 2])
+    x, gradient = th.randn(3, 5, 4), th.randn(3, 5, 2)
+    expected = th.autograd.grad(stack(x), stack.rest[0].weight, gradient)[0]
+    for _ in range(2):
+        stack.evaluate(x)
+        stack.backward(gradient)
+        close(stack.rest[0].weight.grad, expected.double())
+        stack.rest[0].weight.grad.transpose_(1, 2)
 
 
 @pytest.mark.skipif(not hasattr(th.Tensor, "grad_dtype"), reason="this PyTorch has gradients of the parameters' type alone")

@@ -62,3 +62,35 @@ def test_a_target_that_is_not_a_number_is_not_hidden_by_the_lower_one(critic):
     next_q_values[critic, 0, 1] = th.nan
     found = td_targets(th.zeros(3, 1), th.ones(3, 1), next_q_values, th.tensor([0]), 0.9)
     assert found.isnan().tolist() == [[False, True, False]]
+
+
+def test_one_reward_for_all_agents_is_refused():
+    with pytest.raises(IndexError, match="out of bounds"):
+        td_targets(th.ones(3, 1), th.ones(3, 2), th.ones(1, 2, 3), th.tensor([0, 1]), 0.5)
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        lambda: td_targets(th.ones(3, 4), th.ones(3, 4), th.ones(1, 2, 3), th.arange(4), 0.9),
+        lambda: td_targets(th.ones(300, 4), th.ones(300, 4), th.ones(1, 4, 3), th.arange(4), 0.9),
+        lambda: critic_inputs(th.zeros(2, 2), th.ones(2, 8), th.ones(2, 3), AGENT_OF_COLUMN),
+        lambda: critic_inputs(th.zeros(4, 2), th.ones(2, 6), th.ones(2, 3), AGENT_OF_COLUMN),
+    ],
+)
+def test_rows_that_do_not_fit_are_refused(formula):
+    with pytest.raises(RuntimeError, match="size"):
+        formula()
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        lambda: td_targets(th.ones(3, 4), th.ones(3, 4), th.ones(1, 1, 3), th.tensor([9]), 0.9),
+        lambda: loss_shares(th.ones(3, 4), th.tensor([-1])),
+        lambda: critic_inputs(th.zeros(2, 2), th.ones(2, 6), th.ones(2, 1), AGENT_OF_COLUMN),
+    ],
+)
+def test_agents_that_there_are_not_are_refused(formula):
+    with pytest.raises(IndexError, match="there is no such agent in these rows"):
+        formula()

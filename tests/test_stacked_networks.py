@@ -507,6 +507,26 @@ def test_both_steps_are_those_of_autograd(layout, agents, share, layer_norm):
         close(gradient, expected.float(), atol=1e-5)
 
 
+@pytest.mark.parametrize("kind", [StackedCritics, OwnObservationCritics])
+def test_the_second_step_is_at_the_inputs_of_the_first_whatever_comes_between(kind):
+    """More threads or another type: networks are evaluated in other tensors, which have seen no input."""
+    layout = LAYOUTS["one block"]
+    critics = kind(layout, range(layout.n_agents), "observations", [8, 6])
+    own, weights = [th.randn(3, 5, 2)], th.rand(3, 5)
+    with pytest.raises(RuntimeError, match="evaluate the critics before"):
+        critics.ascend(own, weights)
+    inputs = th.randn(5, sum(layout.obs_sizes) + sum(layout.action_sizes))
+    critics.evaluate(inputs)
+    losses, (gradient,) = critics.ascend(own, weights)
+    th.set_num_threads(2)
+    try:
+        again, (gradient_again,) = critics.ascend(own, weights)
+    finally:
+        th.set_num_threads(1)
+    close(again, losses, atol=1e-5)
+    close(gradient_again, gradient, atol=1e-5)
+
+
 def test_own_action_replaced_for_some_of_the_agents():
     """A team: agents 1 and 3 learn; the critics still read everyone's actions."""
     layout = LAYOUTS["several blocks"]

@@ -26,7 +26,7 @@ class Evaluation:
     """
 
     folding = True  # whether rows of members that share a network are one longer minibatch of it, where they can be
-    whole = False  # whether the first layer of all members on a common input is one of many, not one product
+    whole = False  # whether the first layer, too, is done member by member, and not as one product for a common input
 
     def __init__(self, stack: StackedMLP, batch: int, lender: Evaluation | None = None) -> None:
         self.stack, self.batch = stack, batch

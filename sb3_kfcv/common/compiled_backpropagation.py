@@ -123,10 +123,10 @@ class CompiledEvaluation(Evaluation):
         if not self.whole:
             return super().regress(x, targets, weights)
         self._given(x)
-        apart = self._place_gradients()
         errors = th.empty_like(self.value_gradient)
         losses = errors.new_empty(errors.shape[0], errors.shape[2])
         fit = (self._numbers(targets, errors.shape), self._numbers(weights, errors.shape), errors.numpy(), losses.numpy())
+        apart = self._place_gradients()
         regress(self.plan, self.numbers, self.stack.n_networks, self.batch, fit, self.scratch)
         for into, written in apart:
             into.copy_(written)
@@ -187,7 +187,7 @@ class CompiledEvaluation(Evaluation):
     def _through_layers(self, gradient: th.Tensor, parameters: bool) -> None:
         """With the first one where it is compiled and parameters' gradients are wanted."""
         self._require_shape(gradient, (self.shape[0], self.batch, self.stack.sizes[-1]))
-        self.value_gradient.copy_(gradient)
+        self.value_gradient.copy_(gradient.detach())
         layers = self.learnt if parameters else self.passed
         if layers is self.plan:
             self._given(self.x)  # it may have been given another place since
@@ -204,7 +204,8 @@ class CompiledEvaluation(Evaluation):
         """Note where the parameters' gradients are to be written; those that cannot be, with what is to be copied there."""
         gradients = [gradient_of(parameter) for _, _, parameter in self.learnt_parameters]
         pointers = [0 if gradient is None else gradient.data_ptr() for gradient in gradients]
-        if pointers == self.pointers and all(map(is_, gradients, self.placed)):
+        as_they_were = pointers == self.pointers and all(map(is_, gradients, self.placed))
+        if as_they_were and all(gradient is None or gradient.is_contiguous() for gradient in gradients):
             return []
         apart = []
         for i, (into, (layer, name, parameter)) in enumerate(zip(gradients, self.learnt_parameters, strict=True)):

@@ -18,6 +18,8 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
+from sb3_kfcv.common.kernels import kernel
+
 FLOAT, INTEGER = 4, 8
 """Bytes of a number."""
 
@@ -119,7 +121,6 @@ def _strip(n_columns: int) -> Any:
     """The same for all rows of C, tile by tile and then row by row."""
     tile, row = _tile(ROWS, n_columns), _tile(1, n_columns)
 
-    @njit  # on the disk as a part of what calls it
     def add_to_strip(a, a_row, a_column, b, b_row, c, c_row, n_rows, depth):  # type: ignore[no-untyped-def]
         i = 0
         while i + ROWS <= n_rows:
@@ -129,7 +130,10 @@ def _strip(n_columns: int) -> Any:
             row(a + FLOAT * i * a_row, a_row, a_column, b, b_row, depth, c + FLOAT * i * c_row, c_row)
             i += 1
 
-    return add_to_strip
+    # Compiled code knows a function by its name and a number that every process gives anew: where several have one name, code
+    # from the disk would be taken for that of another one.
+    add_to_strip.__name__ = add_to_strip.__qualname__ = f"add_to_strip_of_{n_columns}"
+    return njit(add_to_strip)  # on the disk as a part of what calls it
 
 
 _strip_of_16, _strip_of_4, _strip_of_1 = (_strip(columns) for columns in (16, 4, 1))
@@ -153,7 +157,7 @@ def _reader(kind: types.Type) -> Any:
 _numbers_at, _integers_at = _reader(types.float32), _reader(types.int64)
 
 
-@njit(cache=True)
+@kernel
 def add_product(a, a_row, a_column, b, b_row, c, c_row, n_rows, depth, n_columns):
     """
     C += A B of matrices at addresses, their strides counted in numbers; the rows of B and C are contiguous.
@@ -178,7 +182,7 @@ def add_product(a, a_row, a_column, b, b_row, c, c_row, n_rows, depth, n_columns
             j += 1
 
 
-@njit(cache=True)
+@kernel
 def _fill(address, row, n_rows, n_columns, values):
     """Set every row to the numbers at ``values``, or to 0 where that is 0."""
     source = _numbers_at(values)
@@ -192,7 +196,7 @@ def _fill(address, row, n_rows, n_columns, values):
                 into[j] = source[j]
 
 
-@njit(cache=True)
+@kernel
 def _rectify(address, row, n_rows, n_columns):
     """ReLU in place; what is not a number stays so, and -inf becomes one."""
     for i in range(n_rows):
@@ -201,7 +205,7 @@ def _rectify(address, row, n_rows, n_columns):
             z[j] *= np.float32(not z[j] < 0)  # a product, since choices are not compiled to vectors
 
 
-@njit(cache=True)
+@kernel
 def _through_rectifier(gradient, hidden, row, n_rows, n_columns):
     """Turn the gradient behind a ReLU, whose outputs are given and lie alike, into the one before it; it should be finite."""
     for i in range(n_rows):
@@ -210,7 +214,7 @@ def _through_rectifier(gradient, hidden, row, n_rows, n_columns):
             g[j] *= np.float32(not h[j] <= 0)
 
 
-@njit(cache=True)
+@kernel
 def _add_sums(rows, row, n_rows, n_columns, into, one, scratch):
     """
     Add the sums of columns; of many rows in blocks, so that a long sum does not swallow its last terms.
@@ -229,7 +233,7 @@ def _add_sums(rows, row, n_rows, n_columns, into, one, scratch):
             sums[j] += block[j]
 
 
-@njit(cache=True)
+@kernel
 def _transpose(matrix, n_rows, n_columns, into):
     """Of a contiguous matrix."""
     read, written = _numbers_at(matrix), _numbers_at(into)
@@ -238,7 +242,7 @@ def _transpose(matrix, n_rows, n_columns, into):
             written[j * n_rows + i] = read[i * n_columns + j]
 
 
-@njit(cache=True)
+@kernel
 def _gather_rows(matrix, rows, n_rows, n_columns, into):
     """Some rows of a contiguous matrix, by their numbers."""
     read, written, numbers = _numbers_at(matrix), _numbers_at(into), _integers_at(rows)
@@ -248,7 +252,7 @@ def _gather_rows(matrix, rows, n_rows, n_columns, into):
             written[i * n_columns + j] = read[start + j]
 
 
-@njit(cache=True)
+@kernel
 def _add_to_rows(matrix, rows, n_rows, n_columns, added):
     """Add a contiguous matrix to some rows of another one, by their numbers."""
     written, read, numbers = _numbers_at(matrix), _numbers_at(added), _integers_at(rows)
@@ -258,7 +262,7 @@ def _add_to_rows(matrix, rows, n_rows, n_columns, added):
             written[start + j] += read[i * n_columns + j]
 
 
-@njit(cache=True)
+@kernel
 def _add(numbers, added, n):
     """Add numbers to others."""
     written, read = _numbers_at(numbers), _numbers_at(added)
@@ -266,7 +270,7 @@ def _add(numbers, added, n):
         written[i] += read[i]
 
 
-@njit(cache=True)
+@kernel
 def forward(layers, members, n_rows, rectify_first, scratch):
     """
     Evaluate consecutive layers.
@@ -275,7 +279,7 @@ def forward(layers, members, n_rows, rectify_first, scratch):
     :param members: network of each member
     :param n_rows: rows of each member
     :param rectify_first: whether what the first layer reads is to go through a ReLU, as what all others read
-    :param scratch: room for a row of each layer, and for the weights of one with ``weight_rows``
+    :param scratch: room for the longest row, and for the weights of a layer with ``weight_rows``
     """
     room = scratch.ctypes.data
     for member, network in enumerate(members):
@@ -298,7 +302,7 @@ def forward(layers, members, n_rows, rectify_first, scratch):
             add_product(x, layer.x_row, 1, weight, layer.n_out, z, layer.z_row, n_rows, layer.n_in, layer.n_out)
 
 
-@njit(cache=True)
+@kernel
 def backward(layers, members, n_networks, n_rows, scratch):
     """
     Backpropagation from the last layer's ``z_gradient``: write the gradients of weights, biases and inputs where they have an
@@ -347,7 +351,7 @@ def backward(layers, members, n_networks, n_rows, scratch):
                 _through_rectifier(into, x, layer.x_row, n_rows, n_in)
 
 
-@njit(cache=True)
+@kernel
 def regress(layers, members, n_networks, n_rows, fit, scratch):
     """
     Evaluate, and go back from the losses Σ weights · (targets − values)², summed over the rows.
@@ -378,7 +382,7 @@ def regress(layers, members, n_networks, n_rows, fit, scratch):
     backward(layers, members, n_networks, n_rows, scratch)
 
 
-@njit(cache=True)
+@kernel
 def ascend(firsts, rest, members, n_networks, n_rows, climb, scratch):
     """
     Evaluate with own inputs, and go back to them from the losses −Σ weights · values, summed over the rows, of one value each.

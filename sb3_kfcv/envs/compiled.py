@@ -6,9 +6,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from numba import njit, types
+from numba import types
 from numba.core import event
 from numba.experimental import structref
+
+from sb3_kfcv.common.kernels import kernel
 
 NOTICE = "compiling kernels (once per machine, about 30 s)…"
 
@@ -51,7 +53,7 @@ class Handle(structref.StructRefProxy):
 structref.define_proxy(Handle, _HandleType, ["common", "own"])
 
 
-@njit(cache=True)
+@kernel
 def handle_of(common, own):
     """
     :param common: WorldArrays

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sb3_kfcv.common.kernels import kernel
 from sb3_kfcv.envs import physics
 from sb3_kfcv.envs.drawing import PALETTE, Disc, Scene
 from sb3_kfcv.envs.particle_worlds import REFUSED, ParticleWorlds, require_at_least
@@ -198,7 +198,7 @@ class GrasslandWorlds(ParticleWorlds):
         return Scene(HALF_SIZE, discs, caption=caption)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _reset(worlds, handle, n_wolves):
     """
     Start new episodes.
@@ -238,7 +238,7 @@ def _reset(worlds, handle, n_wolves):
         )
 
 
-@njit(cache=True)
+@kernel
 def _draw_free_position(rng, world, position, half_size, obstacles, reach):
     """
     Draw a position uniformly among those that keep their distance from the obstacles.
@@ -258,13 +258,13 @@ def _draw_free_position(rng, world, position, half_size, obstacles, reach):
                 free = False
 
 
-@njit(cache=True)
+@kernel
 def _draw_grass(rng, world, position, obstacles):
     """Let a piece of grass grow; ``position`` (2,) is filled."""
     _draw_free_position(rng, world, position, GRASS_HALF_SIZE, obstacles, OBSTACLE_RADIUS + GRASS_RADIUS)
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _step(actions, handle, n_wolves, phi, sheep_pays_each, max_steps):
     """
     Step all worlds: forces, motion, rewards, deaths, metrics, observations.
@@ -326,7 +326,7 @@ def _step(actions, handle, n_wolves, phi, sheep_pays_each, max_steps):
     return n_over
 
 
-@njit(cache=True)
+@kernel
 def _hunt(rewards, alive, positions, alive_before, n_wolves, phi, sheep_pays_each, totals):
     """
     Pay wolves and sheep for their distances and captures, and mark the sheep that are eaten.
@@ -362,7 +362,7 @@ def _hunt(rewards, alive, positions, alive_before, n_wolves, phi, sheep_pays_eac
             totals[WOLF_DISTANCE] -= phi * nearest[wolf]
 
 
-@njit(cache=True)
+@kernel
 def _penalise_boundary(rewards, positions, alive_before, n_wolves, totals):
     """
     Charge agents near the edge of the plane.
@@ -376,7 +376,7 @@ def _penalise_boundary(rewards, positions, alive_before, n_wolves, totals):
             totals[WOLF_BOUNDARY if i < n_wolves else SHEEP_BOUNDARY] += BOUNDARY_SLOPE * beyond
 
 
-@njit(cache=True)
+@kernel
 def _graze(rewards, grass, positions, alive_before, n_wolves, obstacles, rng, world, totals):
     """
     Pay the sheep for the grass that they touch, and let what was eaten grow elsewhere.
@@ -395,7 +395,7 @@ def _graze(rewards, grass, positions, alive_before, n_wolves, obstacles, rng, wo
             _draw_grass(rng, world, grass[k], obstacles)
 
 
-@njit(cache=True)
+@kernel
 def _observe(observations, positions, velocities, alive, grass, obstacles):
     """
     Write the agents' observations, one after the other.
@@ -441,7 +441,7 @@ def _observe(observations, positions, velocities, alive, grass, obstacles):
             own[first_obstacle + 2 * k + 1] = obstacles[k, 1] - y
 
 
-@njit(cache=True)
+@kernel
 def _subtract(difference, these, those):
     """Fill ``difference`` with ``these`` less ``those``."""
     for column in range(difference.shape[0]):

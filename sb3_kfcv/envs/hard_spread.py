@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sb3_kfcv.common.kernels import kernel
 from sb3_kfcv.envs import physics
 from sb3_kfcv.envs.drawing import PALETTE, Disc, Rectangle, Scene
 from sb3_kfcv.envs.particle_worlds import REFUSED, ParticleWorlds, require_at_least
@@ -244,7 +244,7 @@ def _check_rooms(walls: list[tuple[float, float]], wall_width: float, door: floa
         face = x + wall_width / 2
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _reset(worlds, handle, wall_width, door, keep_walls):
     """
     Start new episodes.
@@ -278,7 +278,7 @@ def _reset(worlds, handle, wall_width, door, keep_walls):
         _observe(common.observations[world], common.positions[world], common.velocities[world], own.landmarks[world])
 
 
-@njit(cache=True)
+@kernel
 def _draw_walls(rng, world, walls, wall_width, door):
     """
     Draw two walls: room widths uniform among those of at least MIN_ROOM_WIDTH, and per wall a door that is uniform
@@ -295,7 +295,7 @@ def _draw_walls(rng, world, walls, wall_width, door):
         walls[k, 1] = physics.uniform(rng, world, door - HALF_SIZE, HALF_SIZE - door)
 
 
-@njit(cache=True)
+@kernel
 def _draw_free_position(rng, world, position, radius, walls, wall_width, door):
     """
     Draw a position uniformly among those where a disc touches no wall.
@@ -312,7 +312,7 @@ def _draw_free_position(rng, world, position, radius, walls, wall_width, door):
                 free = False
 
 
-@njit(cache=True)
+@kernel
 def _distance_to_wall(position, wall, wall_width, door):
     """Distance of a point from the faces of a wall with a door, 0 inside the wall."""
     across = max(abs(position[0] - wall[0]) - wall_width / 2, 0.0)
@@ -320,7 +320,7 @@ def _distance_to_wall(position, wall, wall_width, door):
     return math.sqrt(across * across + along * along)
 
 
-@njit(cache=True)
+@kernel
 def touches_wall(position, walls, wall_width, door):
     """Whether an agent's centre is closer than its radius to the face of an inner or outer wall."""
     if max(abs(position[0]), abs(position[1])) > HALF_SIZE - AGENT_RADIUS:
@@ -331,7 +331,7 @@ def touches_wall(position, walls, wall_width, door):
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel(nogil=True)
 def _step(actions, handle, wall_width, door, phi, exclusive_cover, max_steps):
     """
     Step all worlds: forces, motion, rewards, metrics, observations.
@@ -394,7 +394,7 @@ def _step(actions, handle, wall_width, door, phi, exclusive_cover, max_steps):
     return n_over
 
 
-@njit(cache=True)
+@kernel
 def _add_wall_contacts(forces, positions, walls, wall_width, door):
     """
     Add the forces of the outer walls, whose faces are the edges of the plane, and of both pieces of each inner wall.
@@ -415,7 +415,7 @@ def _add_wall_contacts(forces, positions, walls, wall_width, door):
                 forces[i, 1] += force_y
 
 
-@njit(cache=True)
+@kernel
 def _find_contacts(collided, positions, walls, wall_width, door, totals):
     """
     Find the agents that touch another one or a wall, and count them.
@@ -437,7 +437,7 @@ def _find_contacts(collided, positions, walls, wall_width, door, totals):
         totals[AGENTS_IN_CONTACT] += collided[i]
 
 
-@njit(cache=True)
+@kernel
 def _find_covered(covers, nearest, positions, landmarks, exclusive_cover, totals):
     """
     Find the agents that stand on a landmark, and how far each is from its nearest one.
@@ -473,7 +473,7 @@ def _find_covered(covers, nearest, positions, landmarks, exclusive_cover, totals
     totals[COVERED_LAST] = covered
 
 
-@njit(cache=True)
+@kernel
 def _observe(observations, positions, velocities, landmarks):
     """
     Write the agents' observations, one after the other.

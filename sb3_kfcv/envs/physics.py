@@ -17,8 +17,8 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 
+from sb3_kfcv.common.kernels import kernel
 from sb3_kfcv.envs.compiled import drop_stale_cache
 
 drop_stale_cache(Path(__file__))
@@ -52,7 +52,7 @@ def rng_state(seed: int | None) -> np.uint64:
     return np.random.SeedSequence(seed).generate_state(1, np.uint64)[0]
 
 
-@njit(cache=True)
+@kernel
 def uniform(rng, world, low, high):
     """
     Draw the next random number of a world, uniform in [low, high).
@@ -68,13 +68,13 @@ def uniform(rng, world, low, high):
     return low + (high - low) * ((bits >> np.uint64(11)) * _2_TO_MINUS_53)
 
 
-@njit(cache=True)
+@kernel
 def clipped(value, limit):
     """``value`` limited to [−limit, limit]."""
     return min(max(value, -limit), limit)
 
 
-@njit(cache=True)
+@kernel
 def all_finite(actions):
     """
     Whether no force is infinite or NaN.
@@ -87,7 +87,7 @@ def all_finite(actions):
     return finite
 
 
-@njit(cache=True)
+@kernel
 def contact_force(overlap):
     """
     Size of the force between two touching things: 100 · softplus(overlap / margin) · margin.
@@ -98,7 +98,7 @@ def contact_force(overlap):
     return CONTACT_FORCE * CONTACT_MARGIN * (max(z, 0.0) + math.log1p(math.exp(-abs(z))))
 
 
-@njit(cache=True)
+@kernel
 def out_of_reach(dx, dy, reach):
     """
     Whether two bodies are too far apart to push each other.
@@ -110,7 +110,7 @@ def out_of_reach(dx, dy, reach):
     return dx * dx + dy * dy > (reach + CONTACT_RANGE) ** 2
 
 
-@njit(cache=True)
+@kernel
 def push_apart(dx, dy, reach):
     """
     Force on a body at (dx, dy) from another one.
@@ -127,7 +127,7 @@ def push_apart(dx, dy, reach):
     return force * dx / distance, force * dy / distance
 
 
-@njit(cache=True)
+@kernel
 def add_body_contacts(forces, positions, radii, alive):
     """
     Add the forces between all pairs of living bodies.
@@ -153,7 +153,7 @@ def add_body_contacts(forces, positions, radii, alive):
             forces[j, 1] -= force_y
 
 
-@njit(cache=True)
+@kernel
 def add_obstacle_contacts(forces, positions, radii, alive, obstacles, obstacle_radius):
     """
     Add the forces of immovable discs on the living bodies.
@@ -178,7 +178,7 @@ def add_obstacle_contacts(forces, positions, radii, alive, obstacles, obstacle_r
             forces[i, 1] += force_y
 
 
-@njit(cache=True)
+@kernel
 def wall_force(across, along, start, end, radius, width):
     """
     Force of a straight wall on a body.
@@ -210,7 +210,7 @@ def wall_force(across, along, start, end, radius, width):
     return side * cosine * force, sine * force
 
 
-@njit(cache=True)
+@kernel
 def integrate(positions, velocities, forces, max_speeds, alive):
     """
     Move the living bodies by one step: v ← 0.75 v + F·dt, limit the speed, x ← x + v·dt with the new v.
@@ -236,7 +236,7 @@ def integrate(positions, velocities, forces, max_speeds, alive):
         positions[i, 1] += velocity_y * DT
 
 
-@njit(cache=True)
+@kernel
 def clip_to_plane(positions, half_size):
     """
     Put centres that left the plane back on its edge; velocities stay.
@@ -249,7 +249,7 @@ def clip_to_plane(positions, half_size):
         positions[i, 1] = clipped(positions[i, 1], half_size)
 
 
-@njit(cache=True)
+@kernel
 def stop_at_mid_line(previous, position, wall_x, door_low, door_high):
     """
     Stop a body whose centre would cross a vertical wall's middle line anywhere but in its door.
@@ -274,7 +274,7 @@ def stop_at_mid_line(previous, position, wall_x, door_low, door_high):
     position[1] = crossing_y
 
 
-@njit(cache=True)
+@kernel
 def squared_distance(a, b):
     """Square of the distance between two points, (2,) each."""
     dx = a[0] - b[0]
@@ -282,7 +282,7 @@ def squared_distance(a, b):
     return dx * dx + dy * dy
 
 
-@njit(cache=True)
+@kernel
 def distance(a, b):
     """Distance between two points, (2,) each."""
     return math.sqrt(squared_distance(a, b))

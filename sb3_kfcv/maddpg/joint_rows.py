@@ -1,6 +1,7 @@
 """
 What an update computes of its minibatch beside the networks. On the CPU each formula is one compiled loop over the rows: as
-several operations of PyTorch it takes longer to begin than to do.
+several operations of PyTorch it takes longer to begin than to do. Other shapes than those that are asked for are PyTorch's to
+spread or to refuse.
 """
 
 from __future__ import annotations
@@ -9,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from numba import njit
 
+from sb3_kfcv.common.kernels import kernel
 from sb3_kfcv.common.live import shares
 
 
@@ -24,7 +25,8 @@ def critic_inputs(seen: th.Tensor, actions: th.Tensor, present: th.Tensor, agent
     :param agent_of_column: whose each column of the joint action is (joint action,)
     :return: (batch, features + joint action)
     """
-    if not _compiled(seen, actions, present):
+    fits = len(seen) == len(actions) == len(present) and actions.shape[1:] == agent_of_column.shape
+    if not (fits and _compiled(seen, actions, present)):
         return th.cat([seen, actions * present.index_select(1, agent_of_column)], dim=1)
     inputs = seen.new_empty(len(seen), seen.shape[1] + actions.shape[1])
     _fill_inputs(_arrays(seen, actions, present, agent_of_column), inputs.numpy())
@@ -59,7 +61,8 @@ def td_targets(
     :param gamma: discount factor
     :return: (agents, batch)
     """
-    if not _compiled(rewards, continues, next_q_values):
+    fits = rewards.shape == continues.shape and next_q_values.shape[1:] == (len(agents), len(rewards))
+    if not (fits and _compiled(rewards, continues, next_q_values)):
         rewards, continues = rewards.T[agents], continues.T[agents]
         return th.addcmul(rewards, continues, next_q_values.amin(0), value=gamma)
     targets = th.empty_like(next_q_values[0])
@@ -72,13 +75,22 @@ def _compiled(*tensors: th.Tensor) -> bool:
 
 
 def _arrays(*tensors: th.Tensor) -> tuple[Any, ...]:
-    return tuple(tensor.contiguous().numpy() for tensor in tensors)
+    return tuple(tensor.detach().contiguous().numpy() for tensor in tensors)
 
 
-@njit(cache=True)
+@kernel
+def _require_agents(agents, values):
+    """There is no look at bounds in compiled code."""
+    for agent in agents:
+        if not 0 <= agent < values.shape[1]:
+            raise IndexError("there is no such agent in these rows")
+
+
+@kernel
 def _fill_inputs(given, inputs):
     seen, actions, present, agent_of_column = given
     n_seen = seen.shape[1]
+    _require_agents(agent_of_column, present)
     for row in range(seen.shape[0]):
         for column in range(n_seen):
             inputs[row, column] = seen[row, column]
@@ -86,9 +98,10 @@ def _fill_inputs(given, inputs):
             inputs[row, n_seen + column] = actions[row, column] * present[row, agent]
 
 
-@njit(cache=True)
+@kernel
 def _fill_shares(given, found):
     alive, agents = given
+    _require_agents(agents, alive)
     for position, agent in enumerate(agents):
         living = np.float32(0)
         for row in range(alive.shape[0]):
@@ -97,9 +110,10 @@ def _fill_shares(given, found):
             found[position, row] = alive[row, agent] / max(living, np.float32(1))
 
 
-@njit(cache=True)
+@kernel
 def _fill_targets(given, gamma, targets):
     rewards, continues, next_q_values, agents = given
+    _require_agents(agents, rewards)
     for position, agent in enumerate(agents):
         for row in range(rewards.shape[0]):
             lowest = next_q_values[0, position, row]

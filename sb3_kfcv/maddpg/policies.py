@@ -17,7 +17,7 @@ from sb3_kfcv.common.actors import ActorPolicy, Block, StackedActors, by_agent, 
 from sb3_kfcv.common.adam import LeanAdam
 from sb3_kfcv.common.backpropagation import Evaluation
 from sb3_kfcv.common.checks import require_count
-from sb3_kfcv.common.compiled_backpropagation import CompiledEvaluation, OwnInputs
+from sb3_kfcv.common.compiled_backpropagation import OwnInputs
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.common.stacked_networks import StackedMLP, at_most
 from sb3_kfcv.saving.archive import open_archive, write_archive
@@ -77,10 +77,12 @@ class CentralCritics(nn.Module):
             run = next(r for r, positions in enumerate(self.positions) if block.positions[0] in positions)
             self._places.append((run, None if block.positions == self.positions[run] else block.positions))
             self.register_buffer(f"_own_rows_{i}", self._own_rows(i, block), persistent=False)
-        starts = [(self.actions_start + block.action_columns.index[:, 0]).tolist() for block in self.blocks]
-        own_actions = [(block.positions, own) for block, own in zip(self.blocks, starts, strict=True)]
-        self._own_inputs = OwnInputs(own_actions, [block.action_size for block in self.blocks])
+        if self.common_input:
+            starts = [(self.actions_start + block.action_columns.index[:, 0]).tolist() for block in self.blocks]
+            own_actions = [(block.positions, own) for block, own in zip(self.blocks, starts, strict=True)]
+            self._own_inputs = OwnInputs(own_actions, [block.action_size for block in self.blocks])
         self._inputs: list[th.Tensor] = []  # of the latest evaluation
+        self._latest_reads: list[th.Tensor] = []  # what each stack reads of them
         # Of the latest evaluation of own actions: the stacks' evaluations, and per block the weights of the own action
         self._moved: list[Evaluation] = []
         self._own_weights: list[th.Tensor] = []
@@ -110,9 +112,9 @@ class CentralCritics(nn.Module):
 
     def evaluate(self, inputs: th.Tensor) -> th.Tensor:
         """As :meth:`forward`, and remembered for :meth:`ascend`; overwritten by the next evaluation."""
-        self._inputs[:] = [inputs]
-        reads = self._reads(inputs)
-        return self._by_critic([stack.evaluate(read) for stack, read in zip(self.stacks, reads, strict=True)])  # type: ignore[operator]
+        self._remember(inputs)
+        found = [stack.evaluate(read) for stack, read in zip(self.stacks, self._latest_reads, strict=True)]  # type: ignore[operator]
+        return self._by_critic(found)
 
     def regress(self, inputs: th.Tensor, targets: th.Tensor, weights: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -124,9 +126,9 @@ class CentralCritics(nn.Module):
         :param weights: of each row in its agent's loss (agents, batch)
         :return: the errors y − Q (critics, agents, batch), and the losses (critics, agents)
         """
-        self._inputs[:] = [inputs]
+        self._remember(inputs)
         found = []
-        for i, (stack, read) in enumerate(zip(self.stacks, self._reads(inputs), strict=True)):
+        for i, (stack, read) in enumerate(zip(self.stacks, self._latest_reads, strict=True)):
             own_targets, own_weights = (self._of_run(values, i % self.n_runs).unsqueeze(-1) for values in (targets, weights))
             found.append(stack.regress(read, own_targets, own_weights))  # type: ignore[operator]
         errors, losses = zip(*found, strict=True)
@@ -140,10 +142,13 @@ class CentralCritics(nn.Module):
         :param own_actions: per block (agents, batch, action)
         :param weights: of each row in its agent's loss (agents, batch)
         :return: the losses (agents,), and the gradients per block (agents, batch, action)
+        :raises RuntimeError: if there are no inputs
         """
-        evaluation = self.stacks[0].evaluation(weights.shape[1])  # type: ignore[operator]
-        if isinstance(evaluation, CompiledEvaluation) and self.common_input and evaluation.whole:
-            return evaluation.ascend(self._inputs[0].unsqueeze(0), self._own_inputs, own_actions, weights)
+        if not self._inputs:
+            raise RuntimeError("evaluate the critics before going up their values")
+        evaluation = self.stacks[0].evaluation(len(self._inputs[0]))  # type: ignore[operator]
+        if self.common_input and evaluation.whole:
+            return evaluation.ascend(self._latest_reads[0], self._own_inputs, own_actions, weights)
         losses = -(self.evaluate_own_actions(own_actions) * weights).sum(-1)
         return losses, self.own_action_gradients(-weights)
 
@@ -163,7 +168,7 @@ class CentralCritics(nn.Module):
         self._own_weights[:] = [
             self._moved[run].first_weights(getattr(self, f"_own_rows_{i}")) for i, (run, _) in enumerate(self._places)
         ]
-        first = [evaluation.first_layer(evaluation.x) for evaluation in self._moved]
+        first = [evaluation.first_layer(read) for evaluation, read in zip(self._moved, self._latest_reads, strict=False)]
         actions = inputs[:, self.actions_start :]
         for (run, members), weights, block, new in zip(self._places, self._own_weights, self.blocks, own_actions, strict=True):
             moved = new - block.action_columns.read(actions)
@@ -191,7 +196,10 @@ class CentralCritics(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """What the latest evaluation left is not copied."""
-        return {**self.__dict__, "_inputs": [], "_moved": [], "_own_weights": []}
+        return {**self.__dict__, "_inputs": [], "_latest_reads": [], "_moved": [], "_own_weights": []}
+
+    def _remember(self, inputs: th.Tensor) -> None:
+        self._inputs[:], self._latest_reads[:] = [inputs], self._reads(inputs)
 
     def _reads(self, inputs: th.Tensor) -> list[th.Tensor]:
         """What each stack reads."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-from numba import njit
+
+from sb3_kfcv.common.kernels import kernel
 
 # Beyond this share of changed rows, sorting anew is faster than moving them.
 SORT_BEYOND = 0.25
@@ -91,7 +92,7 @@ class RankOrder:
         return True
 
 
-@njit(cache=True)
+@kernel
 def places(order, values, rows, rows_values):
     """
     How many rows of an order come before each of some rows: a binary search for all of them together, so that one need not
@@ -116,7 +117,7 @@ def places(order, values, rows, rows_values):
     return found
 
 
-@njit(cache=True)
+@kernel
 def merge(order, leaving, coming, here, into):
     """
     Take rows out of an order, and put rows in.
@@ -145,7 +146,7 @@ def merge(order, leaving, coming, here, into):
     copy(order, read, order.size, into, written)
 
 
-@njit(cache=True)
+@kernel
 def copy(order, first, end, into, target):
     """
     Copy the places from ``first`` to before ``end``, if these are any, to those from ``target`` on.

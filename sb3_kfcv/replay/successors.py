@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numba import njit
 
+from sb3_kfcv.common.kernels import kernel
 from sb3_kfcv.common.memory import require_memory
 
 # Numbers in a row from which on copying it takes longer than finding it.
@@ -135,7 +135,7 @@ def room_apart(n_steps: int, n_worlds: int, share_apart: float) -> int:
     return (min(math.ceil(share_apart * n_steps) + 1, n_steps) + 1) * n_worlds
 
 
-@njit(cache=True)
+@kernel
 def link(step, previous, starts, other_starts, apart, other_apart, place, free, n_free):
     """
     Drop what the rows of the step led to until now, and say of the rows of the step before where it lies what they led to.
@@ -163,7 +163,7 @@ def link(step, previous, starts, other_starts, apart, other_apart, place, free, 
     return n_free
 
 
-@njit(cache=True)
+@kernel
 def same(one, other):
     """Whether two rows of bits are alike. Mostly they are, so that nothing is gained by leaving early."""
     differ = 0
@@ -191,7 +191,7 @@ def copies_are_long(source: np.ndarray, into: np.ndarray) -> bool:
     return source.shape[2] >= LONG and source.dtype == into.dtype
 
 
-@njit(cache=True)
+@kernel
 def gather_short(source, rows, into):
     """:func:`gather` for short rows of any kinds of numbers, none beyond the last."""
     n_worlds = source.shape[1]
@@ -201,7 +201,7 @@ def gather_short(source, rows, into):
             written[j] = read[j]
 
 
-@njit(cache=True)
+@kernel
 def gather_following(starts, apart, place, rows, into):
     """Copy what rows of a ring led to."""
     n_worlds = starts.shape[1]

@@ -8,9 +8,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from numba import njit
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
+from sb3_kfcv.common.kernels import kernel
 from sb3_kfcv.common.layout import AgentLayout
 from sb3_kfcv.envs.drawing import Scene, draw
 from sb3_kfcv.envs.particle_worlds import ParticleWorlds
@@ -214,7 +214,7 @@ class _OneWorld:
         return getattr(self._vec_env.worlds, name)
 
 
-@njit(cache=True)
+@kernel
 def _weighted_sums(values, weights):
     """
     Weighted sum of each row, added up in order: a row's sum does not depend on how many rows there are.
