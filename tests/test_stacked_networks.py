@@ -509,7 +509,7 @@ def test_both_steps_are_those_of_autograd(layout, agents, share, layer_norm):
 
 @pytest.mark.parametrize("kind", [StackedCritics, OwnObservationCritics])
 def test_the_second_step_is_at_the_inputs_of_the_first_whatever_comes_between(kind):
-    """More threads or another type: networks are evaluated in other tensors, which have seen no input."""
+    """With more threads networks are evaluated in other tensors, which have seen no input."""
     layout = LAYOUTS["one block"]
     critics = kind(layout, range(layout.n_agents), "observations", [8, 6])
     own, weights = [th.randn(3, 5, 2)], th.rand(3, 5)

@@ -50,7 +50,7 @@ class LeanAdam(th.optim.Adam):
             self._found = self._find(group)
             return None
         beta1, beta2 = group["betas"]
-        self._found.all_steps.__iadd__(1)
+        self._found.all_steps.__iadd__(1)  # in place, of an array as of a tensor
         th._fused_adam_(
             self._found.parameters,
             gradients,  # type: ignore[arg-type]
