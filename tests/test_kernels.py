@@ -1,6 +1,7 @@
-"""Compiled code on the disk, when several processes want it at once."""
+"""Compiled code on the disk, when several processes want it at once; and the word while it is made."""
 
 import importlib
+import os
 import pkgutil
 import subprocess
 import sys
@@ -13,7 +14,7 @@ from numba.core.caching import IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
 import sb3_kfcv
-from sb3_kfcv.common.kernels import SharedCacheFile, kernel
+from sb3_kfcv.common.kernels import NOTICE, SharedCacheFile, kernel
 
 
 class Slow(SharedCacheFile):
@@ -127,3 +128,19 @@ def test_options_reach_the_compiler():
 def test_numba_still_has_the_files_that_are_shared():
     """If it had not, functions would be compiled and kept as numba does it, and this says so."""
     assert {"load", "save", "_load_index", "_save_index", "_save_data"} <= set(vars(IndexDataCacheFile))
+
+
+DRAW = """
+import numpy as np
+from sb3_kfcv.envs import physics
+physics.uniform(np.zeros(1, dtype=np.uint64), 0, 0.0, 1.0)
+physics.clipped(0.0, 1.0)
+"""
+
+
+def test_compiling_is_told_once_and_then_never_again(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    for expected in (f"{NOTICE}\n", ""):
+        done = subprocess.run([sys.executable, "-c", DRAW], env=environment, capture_output=True, text=True, check=True)
+        assert done.stdout == ""
+        assert done.stderr == expected

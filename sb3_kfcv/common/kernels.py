@@ -1,16 +1,24 @@
-"""Compiled functions, kept on the disk where several processes may need them at once."""
+"""
+Compiled functions: kept on the disk, where several processes may need them at once, and a word while there is nothing to do
+but wait for them.
+"""
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from filelock import FileLock
 from numba import njit
+from numba.core import event
 from numba.core.caching import IndexDataCacheFile
+
+NOTICE = "compiling kernels (once per machine, about 30 s)…"
 
 
 def kernel(function: Callable[..., Any] | None = None, **options: Any) -> Any:
@@ -58,3 +66,38 @@ class SharedCacheFile(IndexDataCacheFile):
             yield
         finally:
             lock.release()
+
+
+def drop_stale_cache(source: Path) -> None:
+    """
+    Delete compiled code that is older than a file.
+
+    numba's disk cache looks at the file of a compiled function alone, not at the files of what it calls, so that
+    worlds, for one, would go on with the physics that they were compiled with.
+
+    :param source: a file that all compiled code beside it depends on
+    """
+    changed = source.stat().st_mtime
+    for compiled in (source.parent / "__pycache__").glob("*.nb[ci]"):
+        try:
+            if compiled.stat().st_mtime < changed:
+                compiled.unlink(missing_ok=True)
+        except OSError:  # another process was faster, or the folder is read-only
+            continue
+
+
+class _Notice(event.Listener):
+    """Says once what the first step is waiting for; what was compiled before is read from the disk, in silence."""
+
+    said = False
+
+    def on_start(self, event: Any) -> None:
+        if not self.said and event.data["dispatcher"].py_func.__module__.startswith("sb3_kfcv."):
+            self.said = True
+            print(NOTICE, file=sys.stderr, flush=True)
+
+    def on_end(self, event: Any) -> None:
+        """The start was told, that is enough."""
+
+
+event.register("numba:compile", _Notice())

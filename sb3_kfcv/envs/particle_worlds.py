@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_kfcv.envs import physics
-from sb3_kfcv.envs.compiled import Handle, handle_of
 from sb3_kfcv.envs.drawing import Scene
+from sb3_kfcv.envs.handles import Handle, handle_of
 
 DISCRETE_DIRECTIONS = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 """Force of each discrete action: stay, +x, −x, +y, −y."""

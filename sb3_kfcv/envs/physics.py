@@ -18,8 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_kfcv.common.kernels import kernel
-from sb3_kfcv.envs.compiled import drop_stale_cache
+from sb3_kfcv.common.kernels import drop_stale_cache, kernel
 
 drop_stale_cache(Path(__file__))
 
