@@ -182,8 +182,6 @@ class MADDPG(JointAlgorithm):
         layout = self.layout
         self.agents = list(layout.members(self.team) if self.team else range(layout.n_agents))
         self.n_learning_agents = len(self.agents)
-        adjoin = self.agents == list(range(self.agents[0], self.agents[-1] + 1))
-        self._learning = slice(self.agents[0], self.agents[-1] + 1) if adjoin else self.agents  # a slice makes no copy
         agent_of_column = [i for i, size in enumerate(layout.action_sizes) for _ in range(size)]
         self._agent_of_column = th.tensor(agent_of_column, device=self.device)
         self._learning_agents = th.tensor(self.agents, device=self.device)
@@ -354,7 +352,7 @@ class MADDPG(JointAlgorithm):
 
         :return: (agents, batch), the learning agents
         """
-        continues = th.rsub(batch.dones, 1)  # 1 − done (batch, agents): also of one that has joined in this step
+        continues = 1 - batch.dones  # (batch, agents): also of one that has joined in this step
         next_actions = self._target_actions(batch.next_observations)
         next_inputs = self._critic_inputs(batch.next_observations, batch.next_states, next_actions, continues)
         next_q_values = self.critic_target.evaluate(next_inputs)  # (critics, agents, batch)
@@ -383,7 +381,7 @@ class MADDPG(JointAlgorithm):
 
     def live(self, batch: JointReplayBufferSamples) -> th.Tensor:
         """(agents, batch): 1 where the learning agent lived at the start of the step."""
-        return batch.alive.T[self._learning]
+        return batch.alive.T[self._learning_agents]
 
     def _critic_inputs(self, observations: th.Tensor, states: th.Tensor, actions: th.Tensor, alive: th.Tensor) -> th.Tensor:
         seen = states if self.critic_input == "state" else observations
@@ -544,7 +542,6 @@ class MADDPG(JointAlgorithm):
         excluded += [
             "agents",
             "n_learning_agents",
-            "_learning",
             "_agent_of_column",
             "_learning_agents",
             "_parameters",
