@@ -1,6 +1,7 @@
 """Compiled layers give the values and gradients of PyTorch, at all sizes, and nothing else is read or written."""
 
 import copy
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -299,3 +300,126 @@ def test_with_more_threads_pytorch_shares_the_work_among_them():
         th.set_num_threads(1)
     assert type(stack.evaluation(5)) is CompiledEvaluation
     assert type(stack.double().evaluation(5)) is Evaluation
+
+
+# Values alone: stacks whose members have inputs of their own, as actors have.
+ACTING = {name: kind for name, kind in KINDS.items() if not kind.get("common_input")}
+
+
+@pytest.fixture
+def without_gradients():
+    with th.no_grad():
+        yield
+
+
+@pytest.mark.usefixtures("without_gradients")
+@pytest.mark.parametrize("batch", [0, 1, 13, 128])
+@pytest.mark.parametrize("sizes", [[5, 7, 6, 2], [24, 64, 64, 5], [3, 20, 1]], ids=str)
+@pytest.mark.parametrize("kind", ACTING)
+def test_values_alone_are_those_of_the_plain_forward(kind, sizes, batch):
+    stack = StackedMLP(4, sizes, **ACTING[kind])
+    x = th.randn(batch, stack.n_members, sizes[0]).transpose(0, 1)  # as in joint rows
+    before = x.clone()
+    expected = copy.deepcopy(stack).double()(x.double())
+    close(stack.values(x), expected)
+    assert not np.array_equal(stack.values(x), stack(x)) or batch <= 1  # they come from other code
+    for member in range(stack.n_members):
+        close(stack.values(x[member], member), expected[member])
+    assert th.equal(x, before)
+
+
+@pytest.mark.usefixtures("without_gradients")
+@pytest.mark.parametrize("kind", ACTING)
+def test_a_row_has_the_same_values_among_others_and_alone(kind):
+    stack = StackedMLP(4, [24, 64, 64, 5], **ACTING[kind])
+    x = th.randn(stack.n_members, 37, 24)
+    together = stack.values(x)
+    for row in range(37):
+        assert th.equal(stack.values(x[:, row : row + 1])[:, 0], together[:, row])
+        assert th.equal(stack.values(x[2, row : row + 1], 2)[0], together[2, row])
+
+
+@pytest.mark.usefixtures("without_gradients")
+def test_values_follow_parameters_hooks_and_the_activation():
+    stack, other = StackedMLP(3, [5, 8, 2]), StackedMLP(3, [5, 8, 2])
+    x, called = th.randn(3, 7, 5), []
+    stack.values(x)
+    for parameter, new in zip(stack.parameters(), other.parameters(), strict=True):
+        parameter.copy_(new)  # where it is
+    close(stack.values(x), other.double()(x.double()))
+    stack.rest[0].weight = nn.Parameter(th.zeros(3, 8, 2))
+    assert th.equal(stack.values(x), stack.rest[0].bias.expand(3, 7, 2))
+    hook = stack.rest[0].register_forward_hook(lambda *_: called.append(1))
+    stack.values(x)
+    assert called
+    hook.remove()
+    stack.values(x)
+    assert len(called) == 1
+    stack.rest[0].weight.normal_()
+    stack.activation = nn.Tanh()
+    assert th.equal(stack.values(x), stack(x))
+
+
+def test_values_have_a_gradient_where_one_is_wanted():
+    stack = StackedMLP(3, [5, 8, 2])
+    stack.values(th.randn(3, 7, 5)).sum().backward()
+    assert all(parameter.grad is not None for parameter in stack.parameters())
+
+
+@pytest.mark.usefixtures("without_gradients")
+def test_values_of_other_inputs_are_left_to_pytorch():
+    stack = StackedMLP(3, [5, 8, 2])
+    for x in (th.randn(3, 7, 5).double(), th.randn(3, 7, 4), th.randn(2, 7, 5)):
+        with pytest.raises(RuntimeError):
+            stack.values(x)
+    turned = th.randn(3, 5, 7).transpose(1, 2)
+    assert th.equal(stack.values(turned), stack(turned))
+
+
+class Acting(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.stack = StackedMLP(3, [5, 8, 2])
+
+    def forward(self, x):
+        return self.stack.values(x)
+
+
+@pytest.mark.filterwarnings("ignore:.*is deprecated:DeprecationWarning")
+@pytest.mark.usefixtures("without_gradients")
+@pytest.mark.parametrize(
+    "taken", [th.jit.trace, lambda acting, x: th.export.export(acting, (x,)).module()], ids=["trace", "export"]
+)
+def test_what_is_exported_holds_the_networks_and_not_their_values(taken):
+    acting = Acting()
+    acting(th.randn(3, 7, 5))
+    x, exported = th.randn(3, 7, 5), taken(acting, th.randn(3, 7, 5))
+    close(exported(x), copy.deepcopy(acting).double().stack(x.double()))
+
+
+@pytest.mark.usefixtures("without_gradients")
+def test_threads_may_ask_for_values_at_once():
+    stack = StackedMLP(4, [24, 64, 64, 5])
+    inputs = [th.randn(4, 1 + 7 * i, 24) for i in range(4)]
+    expected = [stack.values(x) for x in inputs]
+
+    def ask(i):
+        with th.no_grad():
+            return all(th.equal(stack.values(inputs[i]), expected[i]) for _ in range(300))
+
+    with ThreadPoolExecutor(4) as threads:
+        assert all(threads.map(ask, range(4)))
+
+
+def test_values_leave_an_evaluation_as_it_is():
+    stack = StackedMLP(4, [24, 64, 64, 5])
+    x, gradient = th.randn(4, 16, 24), th.randn(4, 16, 5)
+    stack.evaluate(x)
+    stack.backward(gradient)
+    expected = [parameter.grad.clone() for parameter in stack.parameters()]
+    stack.evaluate(x)
+    with th.no_grad():
+        stack.values(th.randn(4, 16, 24))
+    stack.backward(gradient)
+    for parameter, theirs in zip(stack.parameters(), expected, strict=True):
+        assert th.equal(parameter.grad, theirs)

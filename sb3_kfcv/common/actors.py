@@ -176,7 +176,7 @@ class StackedActors(nn.Module):
     def _outputs(self, observations: th.Tensor, learning: bool) -> list[th.Tensor]:
         """What the last layers give, per block (agents, batch, action)."""
         return [
-            (stack.evaluate if learning else stack)(block.obs_columns.read(observations))  # type: ignore[operator]
+            (stack.evaluate if learning else stack.values)(block.obs_columns.read(observations))  # type: ignore[operator]
             for stack, block in zip(self.stacks, self.blocks, strict=True)
         ]
 
@@ -380,7 +380,7 @@ class ActorPolicy(BasePolicy):
         rows = th.as_tensor(np.atleast_2d(observation), dtype=th.float32, device=self.device)
         self.set_training_mode(False)
         with th.no_grad():
-            output = stack.one(member, rows)
+            output = stack.values(rows, member)
         if self.layout.discrete:
             actions = (output if deterministic else gumbel_perturbed(output)).argmax(-1).cpu().numpy()
         else:

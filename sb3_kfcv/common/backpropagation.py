@@ -14,6 +14,33 @@ if TYPE_CHECKING:
 NORM_EPS = 1e-5
 
 
+class AsMade:
+    """
+    What is taken to be of a stack as it is now: where its parameters lie (a module's ``to`` replaces their data), its
+    activation, the number of threads.
+    """
+
+    def __init__(self, stack: StackedMLP) -> None:
+        self.stack, self.activation, self.threads = stack, stack.activation, th.get_num_threads()
+        self.parameters = [
+            (module._parameters, name, parameter, parameter.data_ptr(), parameter.stride())
+            for module in stack.modules()
+            for name, parameter in module._parameters.items()
+            if parameter is not None
+        ]
+
+    def holds(self) -> bool:
+        """Whether it is still so."""
+        return (
+            th.get_num_threads() == self.threads
+            and self.stack._modules["activation"] is self.activation
+            and all(
+                store.get(name) is parameter and parameter.data_ptr() == pointer and parameter.stride() == strides
+                for store, name, parameter, pointer, strides in self.parameters
+            )
+        )
+
+
 class Evaluation:
     """
     The values of a stack at minibatches of one size, and their gradients by the chain rule written out: without autograd's
@@ -40,13 +67,7 @@ class Evaluation:
         self.weights = [(weight.detach(), bias.detach()) for weight, bias in self.parameters]
         self.transposed = [weight.transpose(1, 2) for weight, _ in self.weights]
         self.first, self.first_bias = stack.first.weight.detach(), stack.first.bias.detach()
-        self.activation, self.threads = stack.activation, th.get_num_threads()
-        self.watched = [
-            (module._parameters, name, parameter, parameter.data_ptr(), parameter.stride())
-            for module in stack.modules()
-            for name, parameter in module._parameters.items()
-            if parameter is not None
-        ]
+        self.activation, self.as_made = stack.activation, AsMade(stack)
         self.by_row = self.first.view(-1, self.width)
         self.common = None  # weight and bias of a common input, where they stand side by side
         if stack.common_input and self.wide_rows is None:
@@ -84,17 +105,6 @@ class Evaluation:
             return z, z
         wide = self.first.new_empty(self.batch, stack.n_members * self.width)
         return wide, stack.spread(wide)
-
-    def fits(self) -> bool:
-        """Whether it is for the parameters as they are (a module's ``to`` replaces their data), and for as many threads."""
-        return (
-            th.get_num_threads() == self.threads
-            and self.stack._modules["activation"] is self.activation
-            and all(
-                store.get(name) is parameter and parameter.data_ptr() == pointer and parameter.stride() == strides
-                for store, name, parameter, pointer, strides in self.watched
-            )
-        )
 
     def values(self, x: th.Tensor) -> th.Tensor:
         """

@@ -10,8 +10,8 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_kfcv.common.backpropagation import Evaluation, gradient_of
-from sb3_kfcv.common.compiled_layers import FUSED, LAYER, OWN_INPUTS, ascend, backward, forward, regress
+from sb3_kfcv.common.backpropagation import AsMade, Evaluation, gradient_of
+from sb3_kfcv.common.compiled_layers import FUSED, LAYER, OWN_INPUTS, ascend, backward, forward, regress, values
 
 if TYPE_CHECKING:
     from sb3_kfcv.common.stacked_networks import StackedMLP
@@ -23,12 +23,74 @@ WIDEST_INPUT = 512
 WIDEST_COMMON_INPUT = 1024
 
 
+def serves(stack: StackedMLP) -> bool:
+    """Whether compiled loops are for such a stack, as things are."""
+    return (
+        FUSED
+        and th.get_num_threads() == 1
+        and type(stack.activation) is nn.ReLU
+        and not stack.norms
+        and len(stack.rest) > 0
+        and max(stack.sizes[1:]) <= WIDEST
+        and (stack.common_input or stack.sizes[0] <= WIDEST_INPUT)
+        and all(p.dtype == th.float32 and p.device.type == "cpu" and p.is_contiguous() for p in stack.parameters())
+    )
+
+
+def plan_of(stack: StackedMLP) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Where the parameters of a stack lie.
+
+    :return: array of ``LAYER``; network of each member
+    """
+    plan = np.zeros(1 + len(stack.rest), LAYER)
+    for i, (place, layer) in enumerate(zip(plan, [stack.first, *stack.rest], strict=True)):
+        place["weight"], place["bias"] = layer.weight.data_ptr(), layer.bias.data_ptr()  # type: ignore[operator, union-attr]
+        place["n_in"], place["n_out"] = stack.sizes[i : i + 2]
+    if stack.member_bias is not None:
+        plan[0]["member_bias"] = stack.member_bias.data_ptr()
+    return plan, np.array(range(stack.n_members) if stack.members is None else stack.members.tolist())
+
+
+class CompiledValues:
+    """
+    The values of a stack whose members have inputs of their own, without a way back: of any number of rows, and in tensors
+    of their own, so that several threads may ask at once.
+
+    :param stack: the networks
+    """
+
+    def __init__(self, stack: StackedMLP) -> None:
+        self.as_made = AsMade(stack)
+        self.served = not stack.common_input and serves(stack)
+        self.hooks = [hooks for module in stack.modules() for hooks in (module._forward_pre_hooks, module._forward_hooks)]
+        self.plan, self.networks = plan_of(stack)
+        self.n_in, self.n_out, self.widest = stack.sizes[0], stack.sizes[-1], max(stack.sizes[1:])
+        self.everybody = np.arange(stack.n_members)
+
+    def of(self, x: th.Tensor, member: int | None = None) -> th.Tensor | None:
+        """
+        :param x: (members, batch, in); of one member (1, batch, in)
+        :param member: its number; by default all
+        :return: (members, batch, out) or (1, batch, out); ``None`` if they are for the plain forward
+        """
+        members = self.everybody if member is None else self.everybody[member : member + 1]
+        usual = type(x) is th.Tensor and x.dtype == th.float32 and x.is_cpu and x.ndim == 3 and x.stride(2) == 1
+        if not (self.served and usual and (len(x), x.shape[2]) == (len(members), self.n_in)) or any(self.hooks):
+            return None
+        batch = x.shape[1]
+        out, scratch = x.new_empty(len(x), batch, self.n_out), np.empty((1 + 2 * batch) * self.widest, np.float32)
+        where = x.data_ptr(), x.stride(0), x.stride(1)
+        values(self.plan, members, self.networks, batch, where, out.data_ptr(), scratch)
+        return out
+
+
 class CompiledEvaluation(Evaluation):
     """
     The same by the loops of :mod:`~sb3_kfcv.common.compiled_layers`, on one thread. Only a large first layer on a common
     input, which is one product for all members, stays PyTorch's.
 
-    :param stack: the networks, which :meth:`serves` takes
+    :param stack: the networks, which :func:`serves` takes
     :param batch: rows
     :param lender: an evaluation whose tensors to use if it is of the same kind, for networks of the same shape and type
     """
@@ -38,14 +100,9 @@ class CompiledEvaluation(Evaluation):
     def __init__(self, stack: StackedMLP, batch: int, lender: Evaluation | None = None) -> None:
         self.whole = not stack.common_input or stack.n_members * stack.sizes[0] <= WIDEST_COMMON_INPUT
         super().__init__(stack, batch, lender)
-        numbers = range(stack.n_members) if self.members is None else self.members.tolist()
-        self.numbers = np.array(numbers)  # network of each member
-        self.plan = np.zeros(1 + len(self.weights), LAYER)
-        weights = [(self.first, self.first_bias), *self.weights]
-        for i, (layer, (weight, bias)) in enumerate(zip(self.plan, weights, strict=True)):
-            layer["weight"], layer["bias"] = weight.data_ptr(), bias.data_ptr()
-            layer["n_in"], layer["n_out"] = stack.sizes[i : i + 2]
-            self._lie(layer, "z", self.layers[i])
+        self.plan, self.numbers = plan_of(stack)
+        for layer, z in zip(self.plan, self.layers, strict=True):
+            self._lie(layer, "z", z)
         self.value_gradient = self.layers[-1].new_empty(self.layers[-1].shape)
         for layer, gradient in zip(self.plan, [*self.gradients, self.value_gradient], strict=True):
             self._lie(layer, "z_gradient", gradient)
@@ -79,22 +136,6 @@ class CompiledEvaluation(Evaluation):
             columns = th.arange(stack.sizes[0]).expand(stack.n_members, -1)
             self.rows = stack.first_layer_rows(range(stack.n_members), columns).contiguous()
             first["weight_rows"] = self.rows.data_ptr()
-        if stack.member_bias is not None:
-            first["member_bias"] = stack.member_bias.data_ptr()
-
-    @staticmethod
-    def serves(stack: StackedMLP) -> bool:
-        """Whether it is for such a stack, as things are."""
-        return (
-            FUSED
-            and th.get_num_threads() == 1
-            and type(stack.activation) is nn.ReLU
-            and not stack.norms
-            and len(stack.rest) > 0
-            and max(stack.sizes[1:]) <= WIDEST
-            and (stack.common_input or stack.sizes[0] <= WIDEST_INPUT)
-            and all(p.dtype == th.float32 and p.device.type == "cpu" and p.is_contiguous() for p in stack.parameters())
-        )
 
     @staticmethod
     def _lie(layer: np.void, name: str, tensor: th.Tensor) -> None:

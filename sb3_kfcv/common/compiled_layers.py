@@ -286,20 +286,62 @@ def forward(layers, members, n_rows, rectify_first, scratch):
         for i in range(len(layers)):
             layer = layers[i]
             x, z = layer.x + FLOAT * member * layer.x_member, layer.z + FLOAT * member * layer.z_member
-            size = FLOAT * layer.n_out
             if i > 0 or rectify_first:
                 _rectify(x, layer.x_row, n_rows, layer.n_in)
-            bias = layer.bias + network * size
-            if layer.member_bias:
-                _fill(room, layer.n_out, 1, layer.n_out, bias)
-                _add(room, layer.member_bias + member * size, layer.n_out)
-                bias = room
-            _fill(z, layer.z_row, n_rows, layer.n_out, bias)
-            weight = layer.weight + network * layer.n_in * size
-            if layer.weight_rows:
-                _gather_rows(layer.weight, layer.weight_rows + INTEGER * member * layer.n_in, layer.n_in, layer.n_out, room)
-                weight = room
-            add_product(x, layer.x_row, 1, weight, layer.n_out, z, layer.z_row, n_rows, layer.n_in, layer.n_out)
+            _through_layer(layer, member, network, x, layer.x_row, z, layer.z_row, n_rows, room)
+
+
+@kernel
+def _through_layer(layer, member, network, x, x_row, z, z_row, n_rows, room):
+    """
+    One layer of a member.
+
+    :param x: what it reads; ``x_row``: from row to row
+    :param z: where it writes; ``z_row``: from row to row
+    :param room: as the scratch of :func:`forward`
+    """
+    size = FLOAT * layer.n_out
+    bias = layer.bias + network * size
+    if layer.member_bias:
+        _fill(room, layer.n_out, 1, layer.n_out, bias)
+        _add(room, layer.member_bias + member * size, layer.n_out)
+        bias = room
+    _fill(z, z_row, n_rows, layer.n_out, bias)
+    weight = layer.weight + network * layer.n_in * size
+    if layer.weight_rows:
+        _gather_rows(layer.weight, layer.weight_rows + INTEGER * member * layer.n_in, layer.n_in, layer.n_out, room)
+        weight = room
+    add_product(x, x_row, 1, weight, layer.n_out, z, z_row, n_rows, layer.n_in, layer.n_out)
+
+
+@kernel
+def values(layers, members, networks, n_rows, x, out, scratch):
+    """
+    The values of some members, and nothing else.
+
+    :param layers: array of ``LAYER``, all of a stack with inputs of its members' own; its parameters are read, no places
+    :param members: numbers of the members (m,)
+    :param networks: network of each member of the stack
+    :param n_rows: rows of each
+    :param x: address of the inputs (m, rows, in), and the strides from member to member and from row to row
+    :param out: address of the values (m, rows, out)
+    :param scratch: room for the widest layer: for one row, and twice for all rows of a member
+    """
+    x, x_member, x_row = x
+    room = scratch.ctypes.data
+    widest = len(scratch) // (1 + 2 * n_rows)
+    hidden = room + FLOAT * widest
+    for place, member in enumerate(members):
+        read, row = x + FLOAT * place * x_member, x_row
+        for i in range(len(layers)):
+            layer = layers[i]
+            if i > 0:
+                _rectify(read, row, n_rows, layer.n_in)
+            into = hidden + FLOAT * (i % 2) * n_rows * widest
+            if i == len(layers) - 1:
+                into = out + FLOAT * place * n_rows * layer.n_out
+            _through_layer(layer, member, networks[member], read, row, into, layer.n_out, n_rows, room)
+            read, row = into, layer.n_out
 
 
 @kernel

@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 from sb3_kfcv.common.backpropagation import NORM_EPS, Evaluation
 from sb3_kfcv.common.checks import require_count
-from sb3_kfcv.common.compiled_backpropagation import CompiledEvaluation
+from sb3_kfcv.common.compiled_backpropagation import CompiledEvaluation, CompiledValues, serves
 from sb3_kfcv.common.memory import require_memory
 
 # Minibatch sizes whose tensors a stack keeps: those of a learner, of the worlds that it acts in, and of a refresh's chunks.
@@ -165,6 +165,7 @@ class StackedMLP(nn.Module):
         self.norms = nn.ModuleList(StackedLayerNorm(n_networks, size) for size in sizes[1:-1] if layer_norm)
         self.member_bias: nn.Parameter | None = None
         self._evaluations: dict[int, Evaluation] = {}  # by batch size
+        self._values: CompiledValues | None = None
         self._lender: tuple[StackedMLP, ...] = ()
         self.register_buffer("members", None if members is None else th.tensor(list(members)), persistent=False)
         # Where as many consecutive members share each network, their rows are one longer minibatch of the network.
@@ -209,6 +210,23 @@ class StackedMLP(nn.Module):
             z = z + self.member_bias[member]
         return self._after_first(z, network)[0]
 
+    def values(self, x: th.Tensor, member: int | None = None) -> th.Tensor:
+        """
+        As :meth:`forward`, or as :meth:`one`, for where no gradient is wanted: by compiled loops if the networks are small.
+        Nothing is remembered.
+
+        :param x: (members, batch, in); of one member (batch, in)
+        :param member: its number; by default all
+        :return: (members, batch, out); of one member (batch, out)
+        """
+        if not (th.is_grad_enabled() or th.jit.is_tracing() or th.compiler.is_compiling()):
+            if self._values is None or not self._values.as_made.holds():
+                self._values = CompiledValues(self)
+            found = self._values.of(x) if member is None else self._values.of(x.unsqueeze(0), member)
+            if found is not None:
+                return found if member is None else found[0]
+        return self(x) if member is None else self.one(member, x)
+
     def _after_first(self, z: th.Tensor, members: Any) -> th.Tensor:
         """Outputs, from the pre-activations of the first layer."""
         for i, layer in enumerate(self.rest):
@@ -246,7 +264,7 @@ class StackedMLP(nn.Module):
         :raises RuntimeError: if there is none, or the parameters are no longer those of then
         """
         evaluation = self._evaluations.get(gradient.shape[1])
-        if evaluation is None or not evaluation.fits():
+        if evaluation is None or not evaluation.as_made.holds():
             raise RuntimeError(f"evaluate {gradient.shape[1]} rows with these parameters before going back through them")
         evaluation.backward(gradient)
 
@@ -269,17 +287,17 @@ class StackedMLP(nn.Module):
         :param batch: rows
         """
         found = self._evaluations.get(batch)
-        if found is None or not found.fits():
+        if found is None or not found.as_made.holds():
             if len(self._evaluations) >= SIZES_KEPT:
                 self._evaluations.clear()
             lent = [stack.evaluation(batch) for stack in self._lender]
-            kind = CompiledEvaluation if CompiledEvaluation.serves(self) else Evaluation
+            kind = CompiledEvaluation if serves(self) else Evaluation
             found = self._evaluations[batch] = kind(self, batch, *lent)
         return found
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy evaluates in tensors of its own."""
-        return {**self.__dict__, "_evaluations": {}}
+        return {**self.__dict__, "_evaluations": {}, "_values": None}
 
     def borrow(self, lender: StackedMLP) -> None:
         """
