@@ -1,17 +1,20 @@
 """Compiled layers give the values and gradients of PyTorch, at all sizes, and nothing else is read or written."""
 
 import copy
+import gc
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch as th
 from torch import nn
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from sb3_kfcv.common.backpropagation import Evaluation
 from sb3_kfcv.common.compiled_backpropagation import WIDEST, WIDEST_COMMON_INPUT, CompiledEvaluation
 from sb3_kfcv.common.compiled_layers import add_product
-from sb3_kfcv.common.stacked_networks import StackedMLP
+from sb3_kfcv.common.stacked_networks import StackedLinear, StackedMLP
 
 
 @pytest.fixture(autouse=True)
@@ -360,6 +363,105 @@ def test_values_follow_parameters_hooks_and_the_activation():
     assert th.equal(stack.values(x), stack(x))
 
 
+class Doubled(StackedLinear):
+    def forward(self, x, members=None):
+        return 2 * super().forward(x, members)
+
+
+def replace(stack, name, value):
+    setattr(stack.rest[0], name, value)
+
+
+def give_a_plain_weight(stack):
+    del stack.rest[0].weight
+    stack.rest[0].weight = th.randn(3, 8, 2)
+
+
+def give_a_buffer(stack):
+    del stack.rest[0].weight
+    stack.rest[0].register_buffer("weight", th.randn(3, 8, 2))
+
+
+def give_another_layer(stack, kind):
+    stack.rest[0] = kind(3, 8, 2)
+
+
+def shrink_the_data(stack):
+    for parameter in stack.rest[0].parameters():
+        parameter.data = parameter.data[..., :1]
+
+
+def narrow(stack):
+    stack.first.weight, stack.first.bias = nn.Parameter(th.randn(3, 5, 4)), nn.Parameter(th.randn(3, 1, 4))
+    stack.rest[0].weight = nn.Parameter(th.randn(3, 4, 2))
+
+
+CHANGES = {
+    "weight norm": lambda stack: th.nn.utils.parametrizations.weight_norm(stack.rest[0]),
+    "a plain weight": give_a_plain_weight,
+    "a layer of the same kind": lambda stack: give_another_layer(stack, StackedLinear),
+    "a layer of another kind": lambda stack: give_another_layer(stack, Doubled),
+    "data of another shape": shrink_the_data,
+    "narrower layers": narrow,
+    "a bias that is spread": lambda stack: replace(stack, "bias", nn.Parameter(th.randn(1, 1, 2))),
+    "a buffer": give_a_buffer,
+    "a subclass of a parameter": lambda stack: replace(stack, "weight", type("Odd", (nn.Parameter,), {})(th.randn(3, 8, 2))),
+    "one more layer": lambda stack: stack.rest.append(StackedLinear(3, 2, 2)),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.usefixtures("without_gradients")
+@pytest.mark.parametrize("asked_before", [True, False], ids=["asked before", ""])
+@pytest.mark.parametrize("change", CHANGES)
+def test_values_of_layers_that_others_have_put_there_are_theirs(change, asked_before):
+    stack, x = StackedMLP(3, [5, 8, 2]), th.randn(3, 7, 5)
+    before = stack.values(x) if asked_before else stack(x)
+    CHANGES[change](stack)
+    for _ in range(2):
+        found, expected = stack.values(x), stack(x)
+        th.testing.assert_close(found, expected, atol=1e-6, rtol=1e-5)
+        if change == "a plain weight":
+            stack.rest[0].weight = th.randn(3, 8, 2)
+    assert change == "weight norm" or found.shape != before.shape or not th.allclose(found, before)
+
+
+@pytest.mark.usefixtures("without_gradients")
+def test_hooks_on_all_modules_are_called():
+    stack, x, called = StackedMLP(3, [5, 8, 2]), th.randn(3, 7, 5), []
+    stack.values(x)
+    hook = nn.modules.module.register_module_forward_hook(lambda *_: called.append(1))
+    try:
+        stack.values(x)
+    finally:
+        hook.remove()
+    assert called
+
+
+@pytest.mark.usefixtures("without_gradients")
+def test_transformations_of_functions_see_the_operations():
+    stack, x = StackedMLP(3, [5, 8, 2]), th.randn(3, 7, 5)
+    stack.values(x)
+    traced = make_fx(lambda x: stack.values(x))(th.randn(3, 7, 5))
+    th.testing.assert_close(traced(x), stack(x))
+    several = th.randn(2, 3, 7, 5)
+    th.testing.assert_close(th.vmap(stack.values)(several), th.stack([stack(x) for x in several]))
+
+
+@pytest.mark.usefixtures("without_gradients")
+def test_a_stack_that_has_acted_is_freed_at_once():
+    stack = StackedMLP(3, [5, 8, 2])
+    stack.values(th.randn(3, 7, 5))
+    alive, collecting = weakref.ref(stack), gc.isenabled()
+    gc.disable()
+    try:
+        del stack
+        assert alive() is None
+    finally:
+        if collecting:
+            gc.enable()
+
+
 def test_values_have_a_gradient_where_one_is_wanted():
     stack = StackedMLP(3, [5, 8, 2])
     stack.values(th.randn(3, 7, 5)).sum().backward()
@@ -373,7 +475,7 @@ def test_values_of_other_inputs_are_left_to_pytorch():
         with pytest.raises(RuntimeError):
             stack.values(x)
     turned = th.randn(3, 5, 7).transpose(1, 2)
-    assert th.equal(stack.values(turned), stack(turned))
+    assert th.equal(stack.values(turned), stack.values(turned.contiguous()))
 
 
 class Acting(nn.Module):

@@ -16,14 +16,16 @@ NORM_EPS = 1e-5
 
 class AsMade:
     """
-    What is taken to be of a stack as it is now: where its parameters lie (a module's ``to`` replaces their data), its
-    activation, the number of threads.
+    What is taken to be of a stack as it is now: its modules, where their parameters lie (a module's ``to`` replaces their
+    data) and of what shape they are, the number of threads.
     """
 
     def __init__(self, stack: StackedMLP) -> None:
-        self.stack, self.activation, self.threads = stack, stack.activation, th.get_num_threads()
+        self.threads = th.get_num_threads()
+        holders: tuple[nn.Module, ...] = (stack, stack.rest, stack.norms)
+        self.modules = [(holder._modules, dict(holder._modules)) for holder in holders]
         self.parameters = [
-            (module._parameters, name, parameter, parameter.data_ptr(), parameter.stride())
+            (module._parameters, name, parameter, parameter.data_ptr(), parameter.stride(), parameter.shape)
             for module in stack.modules()
             for name, parameter in module._parameters.items()
             if parameter is not None
@@ -33,10 +35,10 @@ class AsMade:
         """Whether it is still so."""
         return (
             th.get_num_threads() == self.threads
-            and self.stack._modules["activation"] is self.activation
+            and all(now == then for now, then in self.modules)
             and all(
-                store.get(name) is parameter and parameter.data_ptr() == pointer and parameter.stride() == strides
-                for store, name, parameter, pointer, strides in self.parameters
+                own.get(name) is its and its.data_ptr() == pointer and its.stride() == strides and its.shape == shape
+                for own, name, its, pointer, strides, shape in self.parameters
             )
         )
 

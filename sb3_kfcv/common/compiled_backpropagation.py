@@ -11,7 +11,7 @@ import torch as th
 from torch import nn
 
 from sb3_kfcv.common.backpropagation import AsMade, Evaluation, gradient_of
-from sb3_kfcv.common.compiled_layers import FUSED, LAYER, OWN_INPUTS, ascend, backward, forward, regress, values
+from sb3_kfcv.common.compiled_layers import FUSED, LAYER, OWN_INPUTS, ascend, backward, forward, forward_alone, regress
 
 if TYPE_CHECKING:
     from sb3_kfcv.common.stacked_networks import StackedMLP
@@ -28,6 +28,7 @@ def serves(stack: StackedMLP) -> bool:
     return (
         FUSED
         and th.get_num_threads() == 1
+        and stack.layers_are_usual()
         and type(stack.activation) is nn.ReLU
         and not stack.norms
         and len(stack.rest) > 0
@@ -52,10 +53,14 @@ def plan_of(stack: StackedMLP) -> tuple[np.ndarray, np.ndarray]:
     return plan, np.array(range(stack.n_members) if stack.members is None else stack.members.tolist())
 
 
+# Hooks on all modules; those of single modules are the modules' own.
+GLOBAL_HOOKS = (nn.modules.module._global_forward_pre_hooks, nn.modules.module._global_forward_hooks)
+
+
 class CompiledValues:
     """
     The values of a stack whose members have inputs of their own, without a way back: of any number of rows, and in tensors
-    of their own, so that several threads may ask at once.
+    of their own, so that several threads may ask at once. For other stacks there are none.
 
     :param stack: the networks
     """
@@ -63,10 +68,14 @@ class CompiledValues:
     def __init__(self, stack: StackedMLP) -> None:
         self.as_made = AsMade(stack)
         self.served = not stack.common_input and serves(stack)
-        self.hooks = [hooks for module in stack.modules() for hooks in (module._forward_pre_hooks, module._forward_hooks)]
+        if not self.served:
+            return
         self.plan, self.networks = plan_of(stack)
+        self.kept = [parameter.detach() for parameter in stack.parameters()]  # their memory, if others take their place
         self.n_in, self.n_out, self.widest = stack.sizes[0], stack.sizes[-1], max(stack.sizes[1:])
         self.everybody = np.arange(stack.n_members)
+        own_hooks = (hooks for module in stack.modules() for hooks in (module._forward_pre_hooks, module._forward_hooks))
+        self.hooks = [*GLOBAL_HOOKS, *own_hooks]
 
     def of(self, x: th.Tensor, member: int | None = None) -> th.Tensor | None:
         """
@@ -74,14 +83,15 @@ class CompiledValues:
         :param member: its number; by default all
         :return: (members, batch, out) or (1, batch, out); ``None`` if they are for the plain forward
         """
-        members = self.everybody if member is None else self.everybody[member : member + 1]
-        usual = type(x) is th.Tensor and x.dtype == th.float32 and x.is_cpu and x.ndim == 3 and x.stride(2) == 1
-        if not (self.served and usual and (len(x), x.shape[2]) == (len(members), self.n_in)) or any(self.hooks):
+        if not self.served or any(self.hooks) or type(x) is not th.Tensor or not (x.is_cpu and x.dtype == th.float32):
             return None
-        batch = x.shape[1]
+        members = self.everybody if member is None else self.everybody[member : member + 1]
+        if x.ndim != 3 or (len(x), x.shape[2]) != (len(members), self.n_in):
+            return None
+        x, batch = x if x.stride(2) == 1 else x.contiguous(), x.shape[1]
         out, scratch = x.new_empty(len(x), batch, self.n_out), np.empty((1 + 2 * batch) * self.widest, np.float32)
         where = x.data_ptr(), x.stride(0), x.stride(1)
-        values(self.plan, members, self.networks, batch, where, out.data_ptr(), scratch)
+        forward_alone(self.plan, members, self.networks, batch, where, out.data_ptr(), scratch)
         return out
 
 

@@ -314,8 +314,8 @@ def _through_layer(layer, member, network, x, x_row, z, z_row, n_rows, room):
     add_product(x, x_row, 1, weight, layer.n_out, z, z_row, n_rows, layer.n_in, layer.n_out)
 
 
-@kernel
-def values(layers, members, networks, n_rows, x, out, scratch):
+@kernel(nogil=True)
+def forward_alone(layers, members, networks, n_rows, x, out, scratch):
     """
     The values of some members, and nothing else.
 

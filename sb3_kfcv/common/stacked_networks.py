@@ -45,6 +45,16 @@ def at_most(n_weights: float) -> Iterator[None]:
         _weights_left.reset(token)
 
 
+def _is_watched() -> bool:
+    """Whether somebody follows each of PyTorch's operations: an export, a counter, a transformation of functions."""
+    return bool(
+        th.jit.is_tracing()
+        or th.compiler.is_compiling()
+        or th._C._len_torch_dispatch_stack()
+        or th._C._functorch.peek_interpreter_stack()
+    )
+
+
 class StackedLinear(nn.Module):
     """
     ``n`` linear layers side by side: (n, batch, in) → (n, batch, out).
@@ -118,7 +128,7 @@ class StackedMLP(nn.Module):
     common input in an order of its own: ``input_order[i][c]`` is the input of its network that takes column c.
 
     :meth:`forward` is plain PyTorch; :meth:`evaluate` and :meth:`backward` give the same values and gradients faster, see
-    :class:`Evaluation`.
+    :class:`Evaluation`, and :meth:`values` the values alone.
 
     :param n_networks: number of networks
     :param sizes: width of the input, of each hidden layer, and of the output
@@ -212,20 +222,37 @@ class StackedMLP(nn.Module):
 
     def values(self, x: th.Tensor, member: int | None = None) -> th.Tensor:
         """
-        As :meth:`forward`, or as :meth:`one`, for where no gradient is wanted: by compiled loops if the networks are small.
-        Nothing is remembered.
+        As :meth:`forward`, or as :meth:`one`, for where no derivative is wanted: by compiled loops if the networks are small
+        (where what goes into a ReLU is infinite, they may give what is not a number).
 
         :param x: (members, batch, in); of one member (batch, in)
         :param member: its number; by default all
         :return: (members, batch, out); of one member (batch, out)
         """
-        if not (th.is_grad_enabled() or th.jit.is_tracing() or th.compiler.is_compiling()):
-            if self._values is None or not self._values.as_made.holds():
-                self._values = CompiledValues(self)
-            found = self._values.of(x) if member is None else self._values.of(x.unsqueeze(0), member)
+        if not (th.is_grad_enabled() or _is_watched()):
+            compiled = self._values
+            if compiled is None or not compiled.as_made.holds():
+                compiled = self._values = CompiledValues(self)
+            found = compiled.of(x) if member is None else compiled.of(x.unsqueeze(0), member)
             if found is not None:
                 return found if member is None else found[0]
         return self(x) if member is None else self.one(member, x)
+
+    def layers_are_usual(self) -> bool:
+        """Whether its layers and parameters are such as it was made with; what others have put there goes its own way."""
+        layers, sizes = [self.first, *self.rest], list(pairwise(self.sizes))
+        if type(self) is not StackedMLP or len(layers) != len(sizes) or {type(layer) for layer in layers} != {StackedLinear}:
+            return False
+        shapes = [(self.n_networks, n_in, n_out) for n_in, n_out in sizes]
+        if self.common_input:
+            shapes[0] = (1, sizes[0][0], self.n_networks * sizes[0][1])
+        wanted: list[tuple[nn.Module, str, tuple[int, ...]]] = []
+        for layer, (n, n_in, n_out) in zip(layers, shapes, strict=True):
+            wanted += [(layer, "weight", (n, n_in, n_out)), (layer, "bias", (n, 1, n_out))]
+        if self.member_bias is not None:
+            wanted.append((self, "member_bias", (self.n_members, 1, self.sizes[1])))
+        found = [(layer._parameters.get(name), shape) for layer, name, shape in wanted]
+        return all(type(parameter) is nn.Parameter and parameter.shape == shape for parameter, shape in found)
 
     def _after_first(self, z: th.Tensor, members: Any) -> th.Tensor:
         """Outputs, from the pre-activations of the first layer."""
