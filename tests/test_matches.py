@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from mpe2 import simple_tag_v3, simple_world_comm_v3
 from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
 from toy_envs import ToyParallelEnv
 
 from sb3_kfcv import MADDPG, CoTraining, FileFormatError, make_vec_env
@@ -30,8 +31,12 @@ def small_arena(n_envs=5):
 
 @pytest.fixture(scope="module")
 def both_sides(tmp_path_factory):
-    """A model of all agents at the paper's size, trained for a moment; and its file."""
-    model = MADDPG("MlpPolicy", make_vec_env("Grassland-v0", 4, seed=1, env_kwargs=SHORT), **TINY)
+    """
+    A model of all agents at the paper's size, trained for a moment; and its file. PyTorch's products act, not compiled loops,
+    with which a row has the same actions whatever stands beside it.
+    """
+    env = make_vec_env("Grassland-v0", 4, seed=1, env_kwargs=SHORT)
+    model = MADDPG("MlpPolicy", env, policy_kwargs={"activation_fn": nn.Tanh}, **TINY)
     model.learn(40)
     path = tmp_path_factory.mktemp("players") / "both.zip"
     model.save(path)
