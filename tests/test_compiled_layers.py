@@ -22,7 +22,7 @@ def seeded():
     th.manual_seed(0)
 
 
-def close(one, other):
+def assert_close(one, other):
     th.testing.assert_close(one.double(), other, atol=1e-5, rtol=1e-5)
 
 
@@ -78,11 +78,11 @@ def test_evaluation_and_backward_are_those_of_autograd(kind, sizes, batch):
         gradient = th.randn(stack.n_members, batch, sizes[-1]) / batch
         values = exact(x.double())
         expected = th.autograd.grad(values, list(exact.parameters()), gradient.double())
-        close(stack.evaluate(x), values.detach())
+        assert_close(stack.evaluate(x), values.detach())
         assert isinstance(stack.evaluation(batch), CompiledEvaluation)
         stack.backward(gradient)
         for parameter, theirs in zip(stack.parameters(), expected, strict=True):
-            close(parameter.grad, theirs)
+            assert_close(parameter.grad, theirs)
 
 
 @pytest.mark.parametrize("batch", [1, 128])
@@ -99,10 +99,10 @@ def test_least_squares_are_those_of_autograd(kind, sizes, batch):
         theirs = targets - exact(x.double())
         squares = (weights / batch * theirs.square()).sum(1)
         expected = th.autograd.grad(squares.sum(), list(exact.parameters()))
-        close(errors, theirs.detach())
-        close(losses, squares.detach())
+        assert_close(errors, theirs.detach())
+        assert_close(losses, squares.detach())
         for parameter, gradient in zip(stack.parameters(), expected, strict=True):
-            close(parameter.grad, gradient)
+            assert_close(parameter.grad, gradient)
 
 
 @pytest.mark.parametrize("changed", ["targets", "weights"])
@@ -123,7 +123,7 @@ def test_the_gradient_before_the_first_layer_needs_no_gradients_of_parameters(ki
     for of, convert in ((evaluation, th.Tensor.float), (theirs, th.Tensor.double)):
         of.first_layer(convert(x)).add_(0.1)
         of.rest()
-    close(evaluation.backward(gradient, parameters=False), theirs.backward(gradient.double(), parameters=False))
+    assert_close(evaluation.backward(gradient, parameters=False), theirs.backward(gradient.double(), parameters=False))
     assert all(parameter.grad is None for parameter in stack.parameters())
 
 
@@ -138,7 +138,7 @@ def test_inputs_may_lie_apart():
         rows[:, :4].double().expand(3, -1, -1),
     ):
         assert not x.is_contiguous()
-        close(stack.evaluate(x), copy.deepcopy(stack).double()(x.double()).detach())
+        assert_close(stack.evaluate(x), copy.deepcopy(stack).double()(x.double()).detach())
 
 
 @pytest.mark.parametrize("frozen", ["first", "rest.0", "rest.1"])
@@ -158,7 +158,7 @@ def test_gradients_that_others_have_set_are_written_into():
     stack.rest[0].weight.grad = theirs.transpose(1, 2)
     stack.evaluate(x)
     stack.backward(gradient)
-    close(theirs.transpose(1, 2), expected.double())
+    assert_close(theirs.transpose(1, 2), expected.double())
 
 
 def test_gradients_that_others_have_turned_are_written_into():
@@ -168,7 +168,7 @@ def test_gradients_that_others_have_turned_are_written_into():
     for _ in range(2):
         stack.evaluate(x)
         stack.backward(gradient)
-        close(stack.rest[0].weight.grad, expected.double())
+        assert_close(stack.rest[0].weight.grad, expected.double())
         stack.rest[0].weight.grad.transpose_(1, 2)
 
 
@@ -181,7 +181,7 @@ def test_gradients_may_be_of_another_type():
     stack.rest[0].weight.grad = th.ones(3, 6, 2, dtype=th.float64)
     stack.evaluate(x)
     stack.backward(gradient)
-    close(stack.rest[0].weight.grad, expected.double())
+    assert_close(stack.rest[0].weight.grad, expected.double())
 
 
 @pytest.mark.parametrize("change", [th.nn.Module.half, th.nn.Module.double], ids=["half", "double"])
@@ -212,7 +212,7 @@ def test_tensors_of_another_kind_are_not_borrowed(lender):
     other, stack = StackedMLP(**lender), StackedMLP(3, [4, 6, 2])
     stack.borrow(other.double() if double else other)
     x = th.randn(3, 50, 4)
-    close(stack.evaluate(x), copy.deepcopy(stack).double()(x.double()).detach())
+    assert_close(stack.evaluate(x), copy.deepcopy(stack).double()(x.double()).detach())
 
 
 def test_a_refused_input_leaves_the_latest_one():
@@ -222,7 +222,7 @@ def test_a_refused_input_leaves_the_latest_one():
     with pytest.raises(ValueError, match="expected"):
         stack.evaluate(x[:, :, :3])
     stack.backward(gradient)
-    close(stack.first.weight.grad, th.autograd.grad(stack(x), stack.first.weight, gradient)[0].double())
+    assert_close(stack.first.weight.grad, th.autograd.grad(stack(x), stack.first.weight, gradient)[0].double())
 
 
 def test_an_input_that_has_shrunk_is_refused():
@@ -238,9 +238,9 @@ def test_parameters_that_are_replaced_are_met_at_the_next_evaluation():
     stack, x = StackedMLP(3, [4, 6, 6, 2]), th.randn(3, 5, 4)
     stack.evaluate(x)
     stack.rest[0].weight = nn.Parameter(th.randn(3, 6, 6))
-    close(stack.evaluate(x), copy.deepcopy(stack).double()(x.double()).detach())
+    assert_close(stack.evaluate(x), copy.deepcopy(stack).double()(x.double()).detach())
     stack.activation = nn.Tanh()
-    close(stack.evaluate(x), copy.deepcopy(stack).double()(x.double()).detach())
+    assert_close(stack.evaluate(x), copy.deepcopy(stack).double()(x.double()).detach())
 
 
 @pytest.mark.parametrize("members", [[0, 5], [0, -1]])
@@ -324,10 +324,10 @@ def test_values_alone_are_those_of_the_plain_forward(kind, sizes, batch):
     x = th.randn(batch, stack.n_members, sizes[0]).transpose(0, 1)  # as in joint rows
     before = x.clone()
     expected = copy.deepcopy(stack).double()(x.double())
-    close(stack.values(x), expected)
+    assert_close(stack.values(x), expected)
     assert not np.array_equal(stack.values(x), stack(x)) or batch <= 1  # they come from other code
     for member in range(stack.n_members):
-        close(stack.values(x[member], member), expected[member])
+        assert_close(stack.values(x[member], member), expected[member])
     assert th.equal(x, before)
 
 
@@ -349,7 +349,7 @@ def test_values_follow_parameters_hooks_and_the_activation():
     stack.values(x)
     for parameter, new in zip(stack.parameters(), other.parameters(), strict=True):
         parameter.copy_(new)  # where it is
-    close(stack.values(x), other.double()(x.double()))
+    assert_close(stack.values(x), other.double()(x.double()))
     stack.rest[0].weight = nn.Parameter(th.zeros(3, 8, 2))
     assert th.equal(stack.values(x), stack.rest[0].bias.expand(3, 7, 2))
     hook = stack.rest[0].register_forward_hook(lambda *_: called.append(1))
@@ -496,7 +496,7 @@ def test_what_is_exported_holds_the_networks_and_not_their_values(taken):
     acting = Acting()
     acting(th.randn(3, 7, 5))
     x, exported = th.randn(3, 7, 5), taken(acting, th.randn(3, 7, 5))
-    close(exported(x), copy.deepcopy(acting).double().stack(x.double()))
+    assert_close(exported(x), copy.deepcopy(acting).double().stack(x.double()))
 
 
 @pytest.mark.usefixtures("without_gradients")

@@ -24,7 +24,7 @@ def seeded():
     th.manual_seed(0)
 
 
-def close(one, other, atol=1e-6):
+def assert_close(one, other, atol=1e-6):
     th.testing.assert_close(one, other, atol=atol, rtol=1e-5)
 
 
@@ -60,8 +60,8 @@ def stack_and_input(common_input, batch=4, **kwargs):
 def test_outputs_are_those_of_separate_networks(common_input, layer_norm):
     stack, x = stack_and_input(common_input, layer_norm=layer_norm)
     expected = th.stack([net(own) for net, own in zip(separate(stack), spread_inputs(stack, x), strict=True)])
-    close(stack(x), expected)
-    close(stack.evaluate(x), expected)
+    assert_close(stack(x), expected)
+    assert_close(stack.evaluate(x), expected)
 
 
 @NORMS
@@ -69,7 +69,7 @@ def test_outputs_are_those_of_separate_networks(common_input, layer_norm):
 def test_one_member_alone(members, layer_norm):
     stack, x = stack_and_input(False, members=members, layer_norm=layer_norm)
     for member in range(stack.n_members):
-        close(stack.one(member, x[member]), stack(x)[member])
+        assert_close(stack.one(member, x[member]), stack(x)[member])
 
 
 class Leaky(nn.Module):
@@ -110,7 +110,7 @@ def test_evaluation_and_backward_are_those_of_autograd(common_input, kind, hidde
         gradient = th.randn(stack.n_members, 4, 2, dtype=th.double)
         values = stack(x)
         expected = th.autograd.grad(values, list(stack.parameters()), gradient, allow_unused=True)
-        close(stack.evaluate(x), values)
+        assert_close(stack.evaluate(x), values)
         stack.backward(gradient)
         for (name, parameter), theirs in zip(stack.named_parameters(), expected, strict=True):
             if theirs is not None:  # an activation that nothing passes through
@@ -126,7 +126,7 @@ def test_evaluations_of_several_sizes_stand_side_by_side():
     assert th.equal(first, kept)
     assert stack.evaluate(x[:, 2:]).data_ptr() == first.data_ptr()
     for size in range(1, 7):
-        close(stack.evaluate(x[:, :size]), stack(x[:, :size]))
+        assert_close(stack.evaluate(x[:, :size]), stack(x[:, :size]))
     assert len(stack._evaluations) <= 3
 
 
@@ -145,8 +145,8 @@ def test_a_copy_evaluates_with_its_own_parameters(copied, activation_fn):
     other = copied(stack)
     assert not other._evaluations
     nn.init.ones_(other.rest[-1].bias)
-    close(other.evaluate(x), other(x))
-    close(stack.evaluate(x), stack(x))
+    assert_close(other.evaluate(x), other(x))
+    assert_close(stack.evaluate(x), stack(x))
 
 
 @pytest.mark.parametrize("layer", ["first", "rest.0", "rest.1", "norms.0"])
@@ -155,7 +155,7 @@ def test_evaluations_see_new_data_of_any_parameter(layer):
     before = stack.evaluate(x).clone()
     weight = stack.get_parameter(f"{layer}.weight")
     weight.data = th.zeros_like(weight)
-    close(stack.evaluate(x), stack(x))
+    assert_close(stack.evaluate(x), stack(x))
     assert not th.equal(stack.evaluate(x), before)
 
 
@@ -206,7 +206,7 @@ def test_odd_activations_are_followed_too(activation_fn):
     stack.evaluate(x)
     stack.backward(gradient)
     for parameter, theirs in zip(stack.rest[-1].parameters(), expected, strict=True):
-        close(parameter.grad, theirs)
+        assert_close(parameter.grad, theirs)
 
 
 @NORMS
@@ -216,9 +216,9 @@ def test_a_borrower_evaluates_in_the_tensors_of_its_lender(layer_norm):
     other.borrow(one)
     values = one.evaluate(x)
     expected = other(x)
-    close(other.evaluate(x), expected)
-    close(values, expected)
-    close(one.evaluate(x), one(x))
+    assert_close(other.evaluate(x), expected)
+    assert_close(values, expected)
+    assert_close(one.evaluate(x), one(x))
 
 
 def test_network_is_made_of_linear_layers_and_activations():
@@ -245,7 +245,7 @@ def test_network_is_a_copy():
     stack, x = stack_and_input(None)
     before = stack(x)
     nn.init.zeros_(stack.network(0)[0].weight)
-    close(stack(x), before)
+    assert_close(stack(x), before)
 
 
 @NORMS
@@ -266,7 +266,7 @@ def test_adam_steps_are_those_of_separate_networks(common_input, layer_norm):
             adam.step()
     for i, net in enumerate(plain):
         for ours, theirs in zip(stack.network(i).parameters(), net.parameters(), strict=True):
-            close(ours, theirs, atol=1e-5)
+            assert_close(ours, theirs, atol=1e-5)
 
 
 def as_separate_gradients(stack):
@@ -295,11 +295,11 @@ def test_gradients_are_clipped_network_by_network(common_input, layer_norm):
         (net(own).square().mean() * scale).backward()
         norms.append(nn.utils.clip_grad_norm_(net.parameters(), 0.05))
     assert min(norms) < 0.05 < max(norms)
-    close(stack.gradient_norms(), th.stack(norms))
+    assert_close(stack.gradient_norms(), th.stack(norms))
     stack.clip_gradients(0.05)
     for ours, net in zip(as_separate_gradients(stack), plain, strict=True):
         for one, other in zip(ours, net.parameters(), strict=True):
-            close(one, other.grad, atol=2e-6)
+            assert_close(one, other.grad, atol=2e-6)
 
 
 def test_new_networks_are_drawn_as_nn_linear_draws():
@@ -325,8 +325,8 @@ def test_sharing_is_a_one_hot_number_in_the_input(common_input, layer_norm):
     outputs = stack(x)
     for member, net in enumerate(MEMBERS):
         own = x[0 if common_input else member]
-        close(outputs[member], nets[net](with_one_hot(own, member, 5)))
-        close(outputs[member], stack.network(member)(own))
+        assert_close(outputs[member], nets[net](with_one_hot(own, member, 5)))
+        assert_close(outputs[member], stack.network(member)(own))
 
 
 @NORMS
@@ -356,7 +356,7 @@ def test_shared_networks_learn_as_networks_with_a_one_hot_number(common_input, l
         clip_and_step()
     outputs = stack(x)
     for member, net in enumerate(MEMBERS):
-        close(outputs[member], nets[net](with_one_hot(inputs[member], member, 5)), atol=1e-5)
+        assert_close(outputs[member], nets[net](with_one_hot(inputs[member], member, 5)), atol=1e-5)
 
 
 # ---- actors and critics of a world
@@ -399,12 +399,12 @@ def test_critics_of_own_observations_equal_separate_networks(share, layer_norm):
         order = orders[agent] if share else list(range(6))
         for critic in range(2):
             theirs = critics.network(agent, critic)(th.cat([seen, actions[:, order]], dim=1)).squeeze(1)
-            close(critics(inputs)[critic, agent], theirs)
+            assert_close(critics(inputs)[critic, agent], theirs)
         moved = actions.clone()
         moved[:, layout.action_slices[agent]] = own[agent // 2][agent % 2]
         theirs = critics.network(agent)(th.cat([seen, moved[:, order]], dim=1)).squeeze(1)
         critics.evaluate(inputs)
-        close(critics.evaluate_own_actions(own)[agent], theirs)
+        assert_close(critics.evaluate_own_actions(own)[agent], theirs)
 
 
 def test_actors_equal_separate_sb3_actors(layout):
@@ -415,7 +415,7 @@ def test_actors_equal_separate_sb3_actors(layout):
         for agent, own in zip(block.agents, actions, strict=True):
             theirs = sb3_actor(layout.obs_sizes[agent], layout.action_sizes[agent])
             load_linears(theirs.mu, actors.network(agent))
-            close(own, theirs(observations[:, layout.obs_slices[agent]]))
+            assert_close(own, theirs(observations[:, layout.obs_slices[agent]]))
 
 
 def test_critics_equal_separate_sb3_critics(layout):
@@ -429,7 +429,7 @@ def test_critics_equal_separate_sb3_critics(layout):
         for number, network in enumerate(theirs.q_networks):
             load_linears(network, critics.network(agent, number))
         for ours, value in zip(q_values[:, agent], theirs(observations, actions), strict=True):
-            close(ours, value.squeeze(1))
+            assert_close(ours, value.squeeze(1))
 
 
 def box(size):
@@ -473,9 +473,9 @@ def test_own_action_replaced_equals_a_plain_evaluation_and_its_gradient(layout, 
         columns = layout.action_slices[i]
         before, after = inputs[:, : n_obs + columns.start], inputs[:, n_obs + columns.stop :]
         plain = critics.network(i)(th.cat([before, new[i], after], dim=1)).squeeze(1)
-        close(q_values[i], plain, atol=1e-5)
+        assert_close(q_values[i], plain, atol=1e-5)
         (plain * weights[i]).sum().backward()
-        close(gradients[i], new[i].grad, atol=1e-5)
+        assert_close(gradients[i], new[i].grad, atol=1e-5)
 
 
 @NORMS
@@ -491,20 +491,20 @@ def test_both_steps_are_those_of_autograd(layout, agents, share, layer_norm):
     errors, losses = critics.regress(inputs, targets, weights)
     theirs = targets - exact(inputs.double())
     squares = (weights * theirs.square()).sum(-1)
-    close(errors, theirs.detach().float(), atol=1e-5)
-    close(losses, squares.detach().float(), atol=1e-4)
+    assert_close(errors, theirs.detach().float(), atol=1e-5)
+    assert_close(losses, squares.detach().float(), atol=1e-4)
     for parameter, gradient in zip(
         critics.parameters(), th.autograd.grad(squares.sum(), list(exact.parameters())), strict=True
     ):
-        close(parameter.grad, gradient.float(), atol=1e-4)
+        assert_close(parameter.grad, gradient.float(), atol=1e-4)
 
     own = [th.randn(len(block.agents), 7, block.action_size) for block in critics.blocks]
     exact.evaluate(inputs.double())
     q_values = exact.evaluate_own_actions([actions.double() for actions in own])
     losses, gradients = critics.ascend(own, weights)
-    close(losses, -(q_values * weights).sum(-1).float(), atol=1e-4)
+    assert_close(losses, -(q_values * weights).sum(-1).float(), atol=1e-4)
     for gradient, expected in zip(gradients, exact.own_action_gradients(-weights.double()), strict=True):
-        close(gradient, expected.float(), atol=1e-5)
+        assert_close(gradient, expected.float(), atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", [StackedCritics, OwnObservationCritics])
@@ -523,8 +523,8 @@ def test_the_second_step_is_at_the_inputs_of_the_first_whatever_comes_between(ki
         again, (gradient_again,) = critics.ascend(own, weights)
     finally:
         th.set_num_threads(1)
-    close(again, losses, atol=1e-5)
-    close(gradient_again, gradient, atol=1e-5)
+    assert_close(again, losses, atol=1e-5)
+    assert_close(gradient_again, gradient, atol=1e-5)
 
 
 def test_own_action_replaced_for_some_of_the_agents():
@@ -539,7 +539,7 @@ def test_own_action_replaced_for_some_of_the_agents():
     for position, i in enumerate((1, 3)):
         moved = inputs.clone()
         moved[:, n_obs:][:, layout.action_slices[i]] = new[i]
-        close(q_values[position], critics.network(position)(moved).squeeze(1), atol=1e-5)
+        assert_close(q_values[position], critics.network(position)(moved).squeeze(1), atol=1e-5)
 
 
 def test_the_actors_step_gives_the_critics_no_gradient(layout):
@@ -580,5 +580,5 @@ def test_a_shared_critic_reads_the_agent_itself_first(state_size):
     def q_values(order):
         return critics(th.cat([observations[:, order].flatten(1), actions[:, order].flatten(1)], dim=1))[0]
 
-    close(q_values([0, 1, 2])[1], q_values([1, 2, 0])[0])
-    close(q_values([0, 1, 2])[2], q_values([2, 0, 1])[0])
+    assert_close(q_values([0, 1, 2])[1], q_values([1, 2, 0])[0])
+    assert_close(q_values([0, 1, 2])[2], q_values([2, 0, 1])[0])

@@ -25,7 +25,7 @@ from sb3_kfcv.common.checks import require_count
 from sb3_kfcv.common.compiled_backpropagation import CompiledEvaluation, CompiledValues, serves
 from sb3_kfcv.common.memory import require_memory
 
-# Minibatch sizes whose tensors a stack keeps: those of a learner, of the worlds that it acts in, and of a refresh's chunks.
+# Minibatch sizes whose tensors a stack keeps: that of a learner, and those of a refresh's chunks (the last one is shorter).
 SIZES_KEPT = 3
 
 _weights_left: ContextVar[float] = ContextVar("weights_left", default=math.inf)
